@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.geometry.quaternions import relative_rotation, rotation_distance
-from vd.train.alignment.align import AlignTrainer, alignment_losses, make_scenes
+from vd.train.alignment.align import AlignTrainer, Scenes, alignment_losses
 from vd.train.alignment.config import AlignCfg
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
@@ -21,11 +21,10 @@ from vd.vision.cfg import AlignmentCfg
 from vd.vision.finder import LEAST, GoalFinder
 from vd.vision.rotations import (
     cube_rotations,
-    matrices,
+    quaternion_matrices,
     quaternions,
     random_rotations,
     turn_angle,
-    two_columns,
 )
 from vd.vision.saved import AlignmentSpec, load_alignment
 
@@ -54,9 +53,9 @@ def test_rotations_agree_with_scipys():
     np.testing.assert_allclose(rotation_distance(a, b), between.magnitude(), atol=1e-5)
     difference = Rotation.from_quat(relative_rotation(a, b).numpy())
     assert (difference * between.inv()).magnitude().max() < 1e-5
-    columns = two_columns(relative_rotation(a, b))
-    np.testing.assert_allclose(matrices(columns), between.as_matrix(), atol=1e-5)
-    np.testing.assert_allclose(turn_angle(matrices(columns)), between.magnitude(), atol=2e-3)
+    turn = quaternion_matrices(relative_rotation(a, b))
+    np.testing.assert_allclose(turn, between.as_matrix(), atol=1e-5)
+    np.testing.assert_allclose(turn_angle(turn), between.magnitude(), atol=2e-3)
     every = Rotation.concatenate([first, Rotation.create_group("O")])  # of half a turn too
     back = quaternions(torch.tensor(every.as_matrix(), dtype=torch.float32))
     assert (Rotation.from_quat(back.numpy()) * every.inv()).magnitude().max() < 1e-5
@@ -68,7 +67,7 @@ def test_no_rotation_is_far_from_the_starts():
     starts = cube_rotations(CPU)
     torch.testing.assert_close(starts[0], torch.eye(3))
     torch.manual_seed(0)
-    anywhere = matrices(two_columns(random_rotations(2000, CPU)))
+    anywhere = quaternion_matrices(random_rotations(2000, CPU))
     apart = turn_angle(starts.transpose(-1, -2) @ anywhere[:, None]).amin(dim=1)
     assert 0.9 < apart.max() < 1.1
 
@@ -214,7 +213,7 @@ def scenes():
 def make_quick_scenes():
     torch.manual_seed(0)
     hands = Hands(load_hand("dclaw3"), QUICK.hands, device="cpu")
-    return make_scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
+    return Scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
 
 
 def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=None):
@@ -250,7 +249,7 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
 
 
 def test_goals_turned_by_the_network_keep_their_label(scenes):
-    runner = make_runner(scenes, cfg=replace(QUICK, searched_share=1.0))
+    runner = make_runner(scenes)
     pairs = runner.pairs()
     turned = runner.searched(
         pairs, [runner.network.neighbours(c) for c in (pairs.goal, pairs.seen)]

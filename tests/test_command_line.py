@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from vd.train.alignment.cli import parse_alignment
+from vd.train.alignment.cli import ALIGNMENT
 from vd.train.flags import parse_teacher
 from vd.train.presets import PRESETS
+from vd.train.stages import parse_stage
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -107,4 +108,4 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     for line in ("--config {} --print-config teacher", "--print-config teacher --config={}"):
         assert "epochs: 3" in run(f"vd-train {line.format(path)}")[1]
     path.write_text("stage: 1\npreset: cpu-demo")
-    assert parse_alignment(["--config", str(path)]).run.out.name == "cpu-stage1"
+    assert parse_stage(ALIGNMENT, ["--config", str(path)]).run.out.name == "cpu-stage1"

@@ -14,11 +14,10 @@ from vd.policy.senses import Senses
 from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
 from vd.vision.rotations import (
-    matrices,
+    matrices_about,
+    quaternion_matrices,
     random_rotations,
-    rotations_about,
     turn_angle,
-    two_columns,
 )
 from vd.vision.sparse import voxelise
 from vd.vision.student import Belief, InputBuilder, Student, StudentInput, carried, each
@@ -48,15 +47,15 @@ def sights(lead: tuple[int, ...], seed: int = 0, points: int = 60) -> StudentInp
     goal = box_clouds(count, points, generator)
     goal = goal - goal.mean(dim=1, keepdim=True)
     cpu = torch.device("cpu")
-    believed = matrices(two_columns(random_rotations(count, cpu)))
+    believed = quaternion_matrices(random_rotations(count, cpu))
     axis = torch.randn((count, 3), generator=generator)
-    off = matrices(two_columns(rotations_about(axis, 0.5 * torch.ones(count))))
+    off = matrices_about(axis, 0.5 * torch.ones(count))
     position = 0.02 * torch.randn((count, 3), generator=generator) + torch.tensor([0.0, 0, 0.17])
     sight = StudentInput(
         camera=carried(goal, off @ believed, position[:, None]),
         hand=0.05 * torch.randn((count, points, 3), generator=generator),
         goal=goal,
-        goal_rotation=matrices(two_columns(random_rotations(count, cpu))),
+        goal_rotation=quaternion_matrices(random_rotations(count, cpu)),
         proprioception=torch.randn((count, 3 * JOINTS), generator=generator),
         belief=Belief(believed, position),
     )
@@ -172,8 +171,8 @@ def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(devic
     senses = senses_of(hand, 2, place)
     belief = build.first_belief(senses.goal_quat)
     # In the world's axes, about where objects are handled: 8 cm above the table.
-    world = matrices(two_columns(senses.goal_quat)).cpu()
-    to_base = matrices(two_columns(torch.tensor(hand.mount[3:]).float())).T
+    world = quaternion_matrices(senses.goal_quat).cpu()
+    to_base = quaternion_matrices(torch.tensor(hand.mount[3:]).float()).T
     torch.testing.assert_close(belief.rotation.cpu(), to_base @ world)
     torch.testing.assert_close(belief.position.cpu(), torch.tensor([[0.0, 0.0, 0.17]] * 2))
     sight = build(senses, belief)

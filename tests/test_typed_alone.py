@@ -23,9 +23,10 @@ from vd.evaluate.statistics import symmetric_error
 from vd.logs.recording import write_recording
 from vd.policy.agents import default_policy
 from vd.train import adapt, tracker
-from vd.train.alignment.cli import parse_alignment
+from vd.train.alignment.cli import ALIGNMENT
 from vd.train.flags import parse_teacher
-from vd.train.student.cli import parse_student
+from vd.train.stages import parse_stage
+from vd.train.student.cli import STUDENT
 
 
 class ReachedError(Exception):
@@ -34,12 +35,12 @@ class ReachedError(Exception):
 
 LONG = {
     "vd-train teacher": "vd.train.teacher.train",
-    "vd-train student": "vd.train.student.cli._train",
-    "vd-train student --stage 0": "vd.train.student.cli._train",
-    "vd-train student --stage 1": "vd.train.student.cli._train",
-    "vd-train student --stage 2": "vd.train.student.cli._train",
-    "vd-train alignment": "vd.train.alignment.cli._train",
-    "vd-train alignment --stage 1": "vd.train.alignment.cli._train",
+    "vd-train student": "vd.train.stages.train_stage",
+    "vd-train student --stage 0": "vd.train.stages.train_stage",
+    "vd-train student --stage 1": "vd.train.stages.train_stage",
+    "vd-train student --stage 2": "vd.train.stages.train_stage",
+    "vd-train alignment": "vd.train.stages.train_stage",
+    "vd-train alignment --stage 1": "vd.train.stages.train_stage",
     "vd-train adapt": "vd.train.adapt._adapt",
     "vd-train tracker": "vd.train.tracker._track",
     "vd-deploy --twin": "vd.deploy.loop.policy_runner.load_runner",
@@ -129,9 +130,9 @@ def test_what_is_said_asks_for_the_same(typed, monkeypatch):
     said: list[str] = []
     alone = parse_teacher([], say=lambda *words, why: said.extend(map(str, words)))
     assert parse_teacher(said[2:]) == alone and alone.run.device == "cpu"
-    alone = parse_alignment(["--stage", "1"])
+    alone = parse_stage(ALIGNMENT, ["--stage", "1"])
     flags = ["--preset", "cpu-demo", "--teacher", "dclaw4-cube", "--init", "dclaw4-vision"]
-    assert parse_alignment(["--stage", "1", *flags]) == alone
+    assert parse_stage(ALIGNMENT, ["--stage", "1", *flags]) == alone
 
 
 def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, monkeypatch):
@@ -162,10 +163,8 @@ def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
         given.append(cfg)
         return 0
 
-    for place in ("train.teacher.train", "train.adapt._adapt", "train.tracker._track"):
-        monkeypatch.setattr(f"vd.{place}", note)
-    for place in ("alignment", "student"):
-        monkeypatch.setattr(f"vd.train.{place}.cli._train", note)
+    for place in ("teacher.train", "adapt._adapt", "tracker._track", "stages.train_stage"):
+        monkeypatch.setattr(f"vd.train.{place}", note)
     assert typed(f"vd-train {command} --smoke")[0] == 0
     assert not list(tmp_path.iterdir())
     (cfg,) = given
@@ -184,17 +183,17 @@ def test_smoke_tests_run(command, typed):
 
 
 def test_a_stage_begins_from_the_one_before_if_it_was_trained(typed, tmp_path):
-    alone = parse_student(["--stage", "1"])
+    alone = parse_stage(STUDENT, ["--stage", "1"])
     assert alone.init is None
-    before = tmp_path / parse_student([]).run.out
+    before = tmp_path / parse_stage(STUDENT, []).run.out
     small = "--learn.window 2 --learn.batch 2 --clouds.updates 1 --clouds.shapes 2 --clouds.hands 2"
     small += " --student.channels 4 8 --max-steps 4 --logger none"
     assert typed(f"vd-train student --stage 0 {small}")[0] == 0
     assert (before / "policy.safetensors").is_file()
-    begun = parse_student(["--stage", "2"])
+    begun = parse_stage(STUDENT, ["--stage", "2"])
     assert begun.init == before.relative_to(tmp_path) and begun.student.channels == (4, 8)
     # A network of another hand is not taken.
-    assert parse_student(["--stage", "1", "--teacher", "dclaw3"]).init is None
+    assert parse_stage(STUDENT, ["--stage", "1", "--teacher", "dclaw3"]).init is None
     status, said = typed("vd-train student --stage 1 --init dclaw3")
     assert status == 1 and "dclaw3 is no student" in said
 
@@ -268,7 +267,7 @@ def test_a_run_that_goes_on_refuses_to_have_begun_otherwise(flags, message, tmp_
     cfg = STUDENTS["cpu-demo"](0)
     write_config(replace(cfg, run=replace(cfg.run, out=tmp_path)))
     with pytest.raises(ValueError, match=r"--stage 1: the run in .* began with 0"):
-        parse_student(["--out", str(tmp_path), "--resume", "--stage", "1"])
+        parse_stage(STUDENT, ["--out", str(tmp_path), "--resume", "--stage", "1"])
 
 
 def test_ctrl_c_promises_to_go_on_only_where_that_is_possible(typed, tmp_path, monkeypatch):

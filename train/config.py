@@ -142,3 +142,22 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
             f"lower end {low} of --policy.std-range, and needs --policy.distribution "
             "state-dependent"
         )
+
+
+@dataclass
+class StageTaskCfg:
+    """The environments; all else of them is as in the teacher's training, without its noise."""
+
+    objects: tuple[str, ...] = ()
+    """Object sets: names or folders of object USDs; the teacher's by default."""
+    validation: tuple[str, ...] = ()
+    """Object sets to measure on, names or folders, that are not learned from."""
+    num_envs: int = 2048
+    """Environments simulated side by side, in stages that simulate."""
+    seed: int = 0
+    """Seed of every random draw."""
+
+    def validate(self) -> None:
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--", "positive", "num_envs")
+        require(self, "--", "zero or positive", "seed")

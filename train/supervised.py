@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from vd.train.checkpoint import load_checkpoint
 from vd.train.config import RunCfg
-from vd.train.loop import TrainingLoop
+from vd.train.loop import TrainingLoop, check_update
 
 if TYPE_CHECKING:
+    from vd.train.alignment.config import AlignCfg
+    from vd.train.student.config import LearnCfg
     from vd.train.vec_env import ReorientVecEnv
 
 GRAD_NORM = 1.0
@@ -26,8 +28,8 @@ class SupervisedLoop(TrainingLoop):
     Args:
         network: The network.
         run: Run settings.
-        learning_rate: After the warm-up; it falls along a cosine to the end of the run.
-        warmup_steps: Optimiser steps over which it rises from 0.
+        learn: The learning rate, which falls along a cosine to the end of the run, and its warm-up.
+        measure_every: Iterations from one measurement to the next.
         task: The environment's configuration as a dictionary, kept with checkpoints.
         device: Torch device.
         env: Environments that checkpoints hold, if any.
@@ -44,9 +46,9 @@ class SupervisedLoop(TrainingLoop):
         self,
         network: nn.Module,
         run: RunCfg,
+        learn: "AlignCfg | LearnCfg",
         *,
-        learning_rate: float,
-        warmup_steps: int,
+        measure_every: int,
         task: dict[str, Any],
         device: str,
         env: "ReorientVecEnv | None" = None,
@@ -55,8 +57,8 @@ class SupervisedLoop(TrainingLoop):
         self.network = network
         self.optimizer = torch.optim.AdamW(network.parameters())
         self.task = task
-        self._learning_rate = learning_rate
-        self._warmup_steps = warmup_steps
+        self._learn = learn
+        self._measure_every = measure_every
         self._steps_done = 0
 
     def load(self, path: Path) -> None:
@@ -85,40 +87,63 @@ class SupervisedLoop(TrainingLoop):
             for value in self.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
 
-    def _descend(self, loss: torch.Tensor, done: float) -> torch.Tensor:
-        """One optimiser step on the gradient of ``loss``, averaged over processes and clipped.
+    def _descend(self, losses: dict[str, Tensor], done: float) -> dict[str, Tensor]:
+        """One optimiser step on the gradient of a sum, averaged over processes and clipped.
 
         Args:
-            loss: The loss.
+            losses: Losses by name, whose sum it is.
             done: Share of the run that is done.
 
         Returns:
-            Norm of the gradient before clipping, a scalar on the device.
+            The losses, and the norm of the gradient before clipping, scalars on the device.
         """
         self._steps_done += 1
-        warm = min(1.0, self._steps_done / max(1, self._warmup_steps))
+        warm = min(1.0, self._steps_done / max(1, self._learn.warmup_steps))
         left = max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
-        self.optimizer.param_groups[0]["lr"] = self._learning_rate * warm * left
+        self.optimizer.param_groups[0]["lr"] = self._learn.learning_rate * warm * left
         self.optimizer.zero_grad()
-        loss.backward()
+        torch.stack(tuple(losses.values())).sum().backward()
         parameters = list(self.network.parameters())
         if self.is_distributed:
             # Every process has to take part with every weight, also one whose loss does not reach
             # it.
             gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-            flat = nn.utils.parameters_to_vector(gradients)
-            torch.distributed.all_reduce(flat)
-            nn.utils.vector_to_parameters(flat / self.world_size, gradients)
+            flat = self._average(nn.utils.parameters_to_vector(gradients))
+            nn.utils.vector_to_parameters(flat, gradients)
         norm = nn.utils.clip_grad_norm_(parameters, GRAD_NORM)
         self.optimizer.step()
-        return norm.detach()
+        logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
+        logged["loss/grad_norm"] = norm.detach()
+        return logged
 
-    def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
-        """Scalars, averaged over the processes; waits for the device."""
-        values = torch.stack(tuple(figures.values()))
+    def _figures(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
+        """Means over the optimiser steps of an iteration, and every so often what is measured.
+
+        Raises:
+            TrainingDivergedError: One is not finite, or a weight.
+        """
+        means = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
+        iteration = self.iteration + 1
+        if iteration % self._measure_every == 0 or iteration == self.total_iterations:
+            means |= self.measure()
+        figures = self._read(means)
+        check_update(figures, self.network, "lower the learning rate, or take fp32 as precision")
+        return figures
+
+    def measure(self) -> dict[str, Tensor]:
+        """Errors on what is not learned from; empty for none."""
+        return {}
+
+    def _average(self, values: Tensor) -> Tensor:
+        """Mean over the processes, in place."""
         if self.is_distributed:
             torch.distributed.all_reduce(values)
             values /= self.world_size
+        return values
+
+    def _read(self, figures: dict[str, Tensor]) -> dict[str, float]:
+        """Scalars, averaged over the processes; waits for the device."""
+        values = self._average(torch.stack(tuple(figures.values())))
         return dict(zip(figures, values.tolist(), strict=True))
 
     def _done(self) -> float:

@@ -169,8 +169,8 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     network = None
     if cfg.alignment is not None:
-        network, sizes, camera = open_network(cfg.alignment, device)
-        spec = replace(spec, camera=cfg.camera or camera, alignment=sizes)
+        network, camera = open_network(cfg.alignment, device)
+        spec = replace(spec, camera=cfg.camera or camera, alignment=network.cfg)
     return TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
 
 

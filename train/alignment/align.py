@@ -7,13 +7,12 @@ simulation. In stage 1 others are what a camera saw in simulation while the poli
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.command.config import to_dict
@@ -22,8 +21,7 @@ from vd.train.alignment.config import ALIGNMENT_NAME, AlignCfg
 from vd.train.alignment.looks import SimulatedLooks
 from vd.train.checkpoint import save_checkpoint
 from vd.train.config import RunCfg
-from vd.train.loop import check_update
-from vd.train.student.bank import ShapeBank, centred, mesh_points
+from vd.train.student.bank import ShapeBank, centred_points
 from vd.train.student.shapes import made_shapes
 from vd.train.student.views import Hands, Pairs, draw_pairs, joined
 from vd.train.supervised import SupervisedLoop
@@ -31,61 +29,64 @@ from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
 from vd.vision.rotations import chord, turn_angle
 from vd.vision.saved import AlignmentSpec, alignment_export
 
-MESH_POINTS = 6000
-"""Points kept of a mesh: of them each deformed copy draws its own."""
 CLOUDS = 5
 """Points of a shape, in clouds: one is the goal's, of the others the camera sees a part."""
 OFFSET_WEIGHT = 10.0
 """Of the offset [1/m]: a centimetre counts as 0.1 rad, which moves the surface by about as much."""
 WITHIN_RAD = (PAPER.success.rotation_rad, PAPER.success.precise_rad)
 """Errors within which the paper counts a goal as reached."""
-SAME_SURFACE_M = 0.004
-"""Mean distance of the turned goal to the wanted surface within which both look alike: of a
-symmetric object they do in several orientations."""
 UNSEEN_SHAPES = 64
 """Made shapes that are never trained on."""
-LOWER_RATES = "lower --align.learning-rate, or take --align.precision fp32"
-"""Remedy for a network that diverges."""
+NEAR_SHARE = 0.5
+"""Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
+SCAN_SHARE = 0.25
+"""Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
+SEARCHED_SHARE = 0.5
+"""Share of pairs whose goals are first turned as the network says, half of them twice, as later
+passes meet them."""
+SIMULATED_SHARE = 0.5
+"""Stage 1: share of pairs that are of what was seen in simulation; others are made."""
 
 
-@dataclass(frozen=True)
 class Scenes:
-    """Where pairs come from."""
-
-    bank: ShapeBank
-    """What is learned from."""
-    hands: Hands
-    """What hides it."""
-    held_out: dict[str, torch.Tensor]
-    """Shapes that are only measured, by name of the set: points [m] and normals [O, P, 6]."""
-
-
-def make_scenes(
-    objects: Sequence[ObjectModel], held_out: Sequence[ObjectModel], hands: Hands, cfg: AlignCfg
-) -> Scenes:
-    """Shapes to learn from and shapes to measure on.
+    """Where pairs come from.
 
     Args:
         objects: Objects to learn from, deformed.
         held_out: Objects to measure on, as they are; may be none.
         hands: What hides shapes.
         cfg: Settings.
+
+    Attributes:
+        bank: What is learned from.
+        hands: What hides it.
+        held_out: Shapes that are only measured, by name of the set: points [m] and normals
+            [O, P, 6].
     """
-    device, points = hands.eye.device, CLOUDS * cfg.points
-    sets = {"made": made_shapes(UNSEEN_SHAPES, points, device)}
-    if held_out:
-        sets["validation"] = centred(mesh_points(held_out, points, device))
-    meshes = centred(mesh_points(objects, max(MESH_POINTS, points), device))
-    return Scenes(ShapeBank(meshes, cfg.shapes, points), hands, sets)
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        held_out: Sequence[ObjectModel],
+        hands: Hands,
+        cfg: AlignCfg,
+    ) -> None:
+        device = hands.eye.device
+        points = CLOUDS * cfg.points
+        self.hands = hands
+        self.held_out = {"made": made_shapes(UNSEEN_SHAPES, points, device)}
+        if held_out:
+            self.held_out["validation"] = centred_points(held_out, points, device)
+        self.bank = ShapeBank(objects, cfg.shapes, points, device)
 
 
-def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+def alignment_losses(residual: Residual, pairs: Pairs) -> tuple[dict[str, Tensor], Tensor]:
     """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
-    wrong = found.rotation.detach().transpose(-1, -2) @ pairs.rotation
+    wrong = residual.rotation.detach().mT @ pairs.rotation
     error = turn_angle(wrong)
     losses = {
-        "rotation": chord(found.rotation, pairs.rotation).mean(),
-        "offset": OFFSET_WEIGHT * (found.offset - pairs.offset).norm(dim=-1).mean(),
+        "rotation": chord(residual.rotation, pairs.rotation).mean(),
+        "offset": OFFSET_WEIGHT * (residual.offset - pairs.offset).norm(dim=-1).mean(),
     }
     return losses, error
 
@@ -125,8 +126,8 @@ class AlignTrainer(SupervisedLoop):
         super().__init__(
             network,
             run,
-            learning_rate=cfg.learning_rate,
-            warmup_steps=cfg.warmup_steps,
+            cfg,
+            measure_every=cfg.validate_every,
             task=task,
             device=device,
         )
@@ -134,9 +135,6 @@ class AlignTrainer(SupervisedLoop):
         self.cfg = cfg
         self.looks = looks
         self.spec = spec
-        self._compare: nn.Module | Any = network
-        if cfg.compile:  # for each size on its own: that of all, and that of the searched ones
-            self._compare = torch.compile(network, dynamic=False)
         self._half = torch.autocast(
             torch.device(self.device).type, torch.bfloat16, enabled=cfg.precision == "bf16"
         )
@@ -145,72 +143,67 @@ class AlignTrainer(SupervisedLoop):
         return self.cfg.batch * self.cfg.steps
 
     def _iterate(self) -> dict[str, Any] | None:
-        cfg, seen = self.cfg, dict[str, float]()
+        acted: dict[str, float] = {}
         if self.looks is not None:
-            if (collected := self.looks.collect(self._stopping)) is None:
+            collected = self.looks.collect(self._stopping)
+            if collected is None:
                 return None
-            seen = self._read(collected)
+            acted = self._read(collected)
         if self.iteration:
-            self.scenes.bank.renew(cfg.fresh_shapes)
-        done, rows = self._done(), []
-        for _ in range(cfg.steps):
+            self.scenes.bank.renew(self.cfg.fresh_shapes)
+        done = self._done()
+        steps = []
+        for _ in range(self.cfg.steps):
             if self._stopping():
                 return None
-            rows.append(self._step(done))
-        means = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
-        count = self.iteration + 1
-        if count % cfg.validate_every == 0 or count == self.total_iterations:
-            means |= self.measure()
-        figures = self._read(means)
-        check_update(figures, self.network, LOWER_RATES)
-        return figures | seen
+            steps.append(self._step(done))
+        return self._figures(steps) | acted
 
     def pairs(self) -> Pairs:
         """A batch to learn from."""
-        cfg = self.cfg
-        shares = {"near": cfg.near_share, "scans": cfg.scan_share}
-        simulated = 0 if self.looks is None else round(self.looks.cfg.share * cfg.batch)
-        made = self.scenes.bank.draw(cfg.batch - simulated)
-        pairs = draw_pairs(self.scenes.hands, made, cfg.points, **shares)
+        points = self.cfg.points
+        shares = {"near": NEAR_SHARE, "scans": SCAN_SHARE}
+        simulated = 0 if self.looks is None else round(SIMULATED_SHARE * self.cfg.batch)
+        shapes = self.scenes.bank.draw(self.cfg.batch - simulated)
+        made = draw_pairs(self.scenes.hands, shapes, points, **shares)
         if self.looks is None:
-            return pairs
-        return joined(pairs, self.looks.pairs(simulated, cfg.points, **shares))
+            return made
+        return joined(made, self.looks.pairs(simulated, points, **shares))
 
     @torch.no_grad()
-    def searched(self, pairs: Pairs, near: Sequence[torch.Tensor]) -> Pairs:
+    def searched(self, pairs: Pairs, near: Sequence[Tensor]) -> Pairs:
         """Pairs of which some goals are turned as the network says, once or twice.
 
         As a search meets them.
 
         The neighbours of both clouds, ``near``, stay.
         """
-        goal, rotation, surface = pairs.goal.clone(), pairs.rotation.clone(), pairs.surface.clone()
-        rows = torch.randperm(len(goal), device=goal.device)[
-            : round(self.cfg.searched_share * len(goal))
-        ]
+        goal = pairs.goal.clone()
+        rotation = pairs.rotation.clone()
+        surface = pairs.surface.clone()
+        order = torch.randperm(len(goal), device=goal.device)
+        rows = order[: round(SEARCHED_SHARE * len(goal))]
         most = math.ceil(0.75 * len(rows))  # of both passes: half of the rows take both
         for some in (rows[:most], rows[len(rows) - most :]):
+            neighbours = [index[some] for index in near]
             with self._half:
-                found = self._compare(goal[some], pairs.seen[some], [index[some] for index in near])
-            back = found.rotation.transpose(-1, -2)
+                residual = self.network(goal[some], pairs.seen[some], neighbours)
+            back = residual.rotation.mT
             for turned in (goal, rotation, surface):
                 turned[some] = turned[some] @ back
         return replace(pairs, goal=goal, rotation=rotation, surface=surface)
 
-    def _step(self, done: float) -> dict[str, torch.Tensor]:
+    def _step(self, done: float) -> dict[str, Tensor]:
         pairs = self.pairs()
         near = [self.network.neighbours(cloud) for cloud in (pairs.goal, pairs.seen)]
-        if self.cfg.searched_share > 0.0:
-            pairs = self.searched(pairs, near)
+        pairs = self.searched(pairs, near)
         with self._half:
-            found = self._compare(pairs.goal, pairs.seen, near)
-        losses, error = alignment_losses(found, pairs)
-        norm = self._descend(torch.stack(tuple(losses.values())).sum(), done)
-        logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
-        return logged | {"loss/grad_norm": norm, "alignment/rotation_error": error.median()}
+            residual = self.network(pairs.goal, pairs.seen, near)
+        losses, error = alignment_losses(residual, pairs)
+        return self._descend(losses, done) | {"alignment/rotation_error": error.median()}
 
     @torch.no_grad()
-    def measure(self) -> dict[str, torch.Tensor]:
+    def measure(self) -> dict[str, Tensor]:
         """Figures of first looks at shapes not learned from, whole goals and scans.
 
         Processes share them.
@@ -218,35 +211,27 @@ class AlignTrainer(SupervisedLoop):
         Medians are means of the processes' medians.
         """
         figures = {}
-        for (name, shapes), kind in product(self.scenes.held_out.items(), ("", "_scans")):
-            views = max(1, self.cfg.views // (self.world_size * (4 if name == "made" else 1)))
-            error, offset, surface = self._errors(
-                shapes.repeat(views, 1, 1), scans=float(kind != "")
-            )
-            name += kind
-            figures[f"{name}/rotation_error"] = error.median()
-            for bound in WITHIN_RAD:
-                figures[f"{name}/within_{bound:g}"] = (error < bound).float().mean()
-            figures[f"{name}/same_surface"] = (surface < SAME_SURFACE_M).float().mean()
-            figures[f"{name}/offset_error"] = offset.median()
+        for name, shapes in self.scenes.held_out.items():
+            processes = self.world_size * (4 if name == "made" else 1)
+            views = shapes.repeat(max(1, self.cfg.views // processes), 1, 1)
+            for kind, scans in (("", 0.0), ("_scans", 1.0)):
+                error, offset = self._errors(views, scans)
+                figures[f"{name}{kind}/rotation_error"] = error.median()
+                figures[f"{name}{kind}/offset_error"] = offset.median()
+                for bound in WITHIN_RAD:
+                    figures[f"{name}{kind}/within_{bound:g}"] = (error < bound).float().mean()
         return figures
 
-    def _errors(
-        self, shapes: torch.Tensor, *, scans: float
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Errors of a first look.
-
-        Rotation [rad], place [m], distance of the surfaces [m], [B] each.
-        """
-        parts = []
+    def _errors(self, shapes: Tensor, scans: float) -> tuple[Tensor, Tensor]:
+        """Errors of first looks: angles [rad] and distances [m] [S]."""
+        errors = []
+        offsets = []
         for some in shapes.split(max(1, self.cfg.batch // 8)):
             pairs = draw_pairs(self.scenes.hands, some, self.cfg.points, scans=scans)
-            found = Aligner(self.network, pairs.goal).look(pairs.seen)
-            wrong = found.rotation.transpose(-1, -2) @ pairs.rotation
-            apart = torch.cdist(pairs.goal @ wrong, pairs.surface).amin(dim=-1).mean(dim=-1)
-            parts.append((turn_angle(wrong), (found.position - pairs.offset).norm(dim=-1), apart))
-        error, offset, surface = (torch.cat(values) for values in zip(*parts, strict=True))
-        return error, offset, surface
+            alignment = Aligner(self.network, pairs.goal).look(pairs.seen)
+            errors.append(turn_angle(alignment.rotation.mT @ pairs.rotation))
+            offsets.append((alignment.position - pairs.offset).norm(dim=-1))
+        return torch.cat(errors), torch.cat(offsets)
 
     def _shared_state(self) -> dict[str, Any]:
         return super()._shared_state() | {"spec": to_dict(self.spec)}

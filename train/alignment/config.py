@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from vd.train.config import RunCfg, require
+from vd.train.config import RunCfg, StageTaskCfg, require
 from vd.train.presets import SMOKE_RUN
 from vd.vision.cfg import SEEN_POINTS, AlignmentCfg
 
@@ -38,8 +38,6 @@ class AlignCfg:
     """Optimiser steps over which the learning rate rises from 0, linearly."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the network's products."""
-    compile: bool = False
-    """Compile the network first, which takes a minute and a C compiler; then steps are shorter."""
     shapes: int = 40_000
     """Shapes in memory, half made and half deformed objects; 0.6 GB. With 159 the errors of shapes
     that were not learned from are half as large again."""
@@ -49,18 +47,6 @@ class AlignCfg:
     """Random postures of the hand that hide shapes; 0.15 GB."""
     points: int = 512
     """Points of each cloud."""
-    near_share: float = 0.5
-    """Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
-    searched_share: float = 0.5
-    """Share of pairs whose goals are first turned as the network says, half of them twice, as later
-    passes meet them. Without, 1.8 M pairs after the same start, first looks within 0.4 rad were
-    57.5 instead of 61.8 % (difference 1.0 to 7.3), when the network chose among ends itself."""
-    scan_share: float = 0.25
-    """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
-    validation: tuple[str, ...] = ()
-    """Object sets to measure on, names or folders, that are not learned from; besides made
-    shapes.
-    """
     validate_every: int = 20
     """Iterations from one measurement to the next."""
     views: int = 64
@@ -76,7 +62,6 @@ class AlignCfg:
         positive = "batch steps learning_rate shapes hands points validate_every views"
         require(self, "--align.", "positive", positive)
         require(self, "--align.", "zero or positive", "warmup_steps fresh_shapes")
-        require(self, "--align.", "in [0, 1]", "near_share searched_share scan_share")
         self.network.validate()
         if self.points < max(self.network.tokens, self.network.neighbours):
             raise ValueError(
@@ -95,8 +80,6 @@ class LooksCfg:
     """Latest looks in memory, to learn from: those of the last 25 iterations of 2048 environments;
     1.3 GB.
     """
-    share: float = 0.5
-    """Share of pairs that are of these; others are made."""
 
     def validate(self) -> None:
         """Refuse settings that cannot train.
@@ -105,19 +88,6 @@ class LooksCfg:
             ValueError: The flag, its value and what it has to be.
         """
         require(self, "--looks.", "positive", "steps kept")
-        require(self, "--looks.", "in [0, 1]", "share")
-
-
-@dataclass
-class AlignmentTaskCfg:
-    """The environments; all else of them is as in the teacher's training, without its noise."""
-
-    objects: tuple[str, ...] = ()
-    """Object sets: names or folders of object USDs; the teacher's by default."""
-    num_envs: int = 2048
-    """Environments simulated side by side, in stage 1."""
-    seed: int = 0
-    """Seed of every random draw."""
 
 
 @dataclass
@@ -148,7 +118,7 @@ class AlignmentTrainCfg:
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     align: AlignCfg = field(default_factory=AlignCfg)
     looks: LooksCfg = field(default_factory=LooksCfg)
-    task: AlignmentTaskCfg = field(default_factory=AlignmentTaskCfg)
+    task: StageTaskCfg = field(default_factory=StageTaskCfg)
 
     def validate(self) -> None:
         """Refuse settings that cannot train.
@@ -159,8 +129,11 @@ class AlignmentTrainCfg:
         self.run.validate()
         self.align.validate()
         self.looks.validate()
-        require(self.task, "--", "positive", "num_envs")
-        require(self.task, "--", "zero or positive", "seed")
+        self.task.validate()
+        if self.stage == SIMULATED and self.init is None:
+            raise ValueError(
+                "--stage 1 begins from a network of stage 0; give its alignment.pt as --init"
+            )
         if self.stage == SIMULATED and self.align.points > SEEN_POINTS:
             raise ValueError(
                 f"--align.points is {self.align.points}; policies look at {SEEN_POINTS}, at most"
@@ -200,7 +173,7 @@ def cpu_demo(stage: Stage) -> AlignmentTrainCfg:
             views=4,
         ),
         looks=LooksCfg(kept=2000),
-        task=AlignmentTaskCfg(num_envs=16),
+        task=StageTaskCfg(num_envs=16),
     )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 import warp as wp
+from torch import Tensor
 
 from vd.evaluate.tracking import CameraActor
 from vd.geometry.quaternions import poses_in, rotation_distance
@@ -20,7 +21,7 @@ from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 from vd.vision.cfg import SEEN_POINTS
 from vd.vision.finder import GoalFinder
-from vd.vision.rotations import matrices, two_columns
+from vd.vision.rotations import quaternion_matrices
 
 ENDS = ("task/reached", "task/dropped", "task/timed_out")
 """How goals end; shares of the environments in each step."""
@@ -41,24 +42,28 @@ class SimulatedLooks:
         self,
         env: ReorientVecEnv,
         policy: TrackingPolicy,
-        surfaces: torch.Tensor,
+        surfaces: Tensor,
         cfg: LooksCfg,
         seed: int,
     ):
-        self.cfg, self._env, self._surfaces = cfg, env, surfaces
-        simulation, place = env.env, surfaces.device
+        self.cfg = cfg
+        self._env = env
+        self._surfaces = surfaces
+        place = surfaces.device
+        simulation = env.env
+        scene = simulation.scene
         self._actor = CameraActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
-        self._pose = wp.to_torch(simulation.sim.body_q)[:, simulation.scene.object_body]
+        self._pose = wp.to_torch(simulation.sim.body_q)[:, scene.object_body]
         self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=place)
-        self._object = torch.tensor(np.asarray(simulation.scene.world_object), device=place)
-        self._scale = torch.tensor(np.asarray(simulation.scene.world_scale), device=place).float()
+        self._object = torch.tensor(np.asarray(scene.world_object), device=place)
+        self._scale = torch.tensor(np.asarray(scene.world_scale), device=place).float()
         self._seen = torch.empty((cfg.kept, SEEN_POINTS, 3), dtype=torch.half, device=place)
         self._poses = torch.empty((cfg.kept, 7), device=place)
         self._envs = torch.empty(cfg.kept, dtype=torch.long, device=place)
-        self._next, self._full = 0, False
+        self._kept = 0
 
     @torch.no_grad()
-    def collect(self, stopping: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
+    def collect(self, stopping: Callable[[], bool]) -> dict[str, Tensor] | None:
         """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
         logs = []
         errors = []
@@ -88,12 +93,14 @@ class SimulatedLooks:
 
         Clouds of ``points``.
         """
-        device, known = self._surfaces.device, len(self._seen) if self._full else self._next
-        drawn = torch.randint(known, (count,), device=device)
-        envs, pose = self._envs[drawn], self._poses[drawn]
+        device = self._surfaces.device
+        drawn = torch.randint(min(self._kept, self.cfg.kept), (count,), device=device)
+        envs = self._envs[drawn]
+        pose = self._poses[drawn]
         order = torch.randperm(self._surfaces.shape[1], device=device)
-        shapes = self._scale[envs, None, None] * self._surfaces[self._object[envs]][:, order]
-        turn = matrices(two_columns(pose[:, 3:]))
+        surfaces = self._surfaces[self._object[envs]][:, order]
+        shapes = self._scale[envs, None, None] * surfaces
+        turn = quaternion_matrices(pose[:, 3:])
         seen = self._seen[drawn, :points].float()
         return with_goals(shapes, turn, pose[:, :3], seen, near=near, scans=scans)
 
@@ -101,8 +108,10 @@ class SimulatedLooks:
         """Release the environments."""
         self._env.env.close()
 
-    def _keep(self, seen: torch.Tensor, pose: torch.Tensor, envs: torch.Tensor) -> None:
-        place = (self._next + torch.arange(len(envs), device=envs.device)) % len(self._seen)
-        self._seen[place], self._poses[place], self._envs[place] = seen.half(), pose, envs
-        self._full |= self._next + len(envs) >= len(self._seen)
-        self._next = (self._next + len(envs)) % len(self._seen)
+    def _keep(self, seen: Tensor, pose: Tensor, envs: Tensor) -> None:
+        places = torch.arange(self._kept, self._kept + len(envs), device=envs.device)
+        places %= self.cfg.kept
+        self._seen[places] = seen.half()
+        self._poses[places] = pose
+        self._envs[places] = envs
+        self._kept += len(envs)

@@ -5,14 +5,13 @@ from pathlib import Path
 from vd.policy import SUFFIX, has_suffix
 from vd.train.alignment.config import ALIGNMENT_NAME, PRESETS
 from vd.vision.alignment import AlignmentNetwork
-from vd.vision.cfg import AlignmentCfg
 from vd.vision.saved import load_alignment
 
 
 def open_network(
     name: str, device: str = "cpu"
-) -> tuple[AlignmentNetwork, AlignmentCfg, tuple[float, ...] | None]:
-    """A network of alignment, its sizes, and the camera of its training (None: the hand's).
+) -> tuple[AlignmentNetwork, tuple[float, ...] | None]:
+    """A network of alignment, and the camera of its training (None: the hand's).
 
     Args:
         name: An ``alignment.pt`` of vd-train alignment, or a vision policy, by its name or file.
@@ -27,12 +26,11 @@ def open_network(
 
     if name not in installed_policies() and not has_suffix(name, SUFFIX):
         network, learned = load_alignment(name, device)
-        return network, learned.network, learned.camera
+        return network, learned.camera
     policy = open_policy(name, device)
     if not isinstance(policy, TrackingPolicy) or policy.alignment is None:
         raise ValueError(f"{name} finds nothing by its goal's points; name a vision policy")
-    assert policy.spec.alignment is not None
-    return policy.alignment, policy.spec.alignment, policy.spec.camera
+    return policy.alignment, policy.spec.camera
 
 
 def default_network(hand: str, preset: str) -> str:

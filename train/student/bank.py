@@ -2,31 +2,35 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 import trimesh
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.train.student.shapes import made_shapes, mesh_shapes
 
+MESH_POINTS = 6000
+"""Points kept of a mesh: of them each deformed copy draws its own."""
 SHAPES_AT_ONCE = 128
 """Shapes made at a time: their bodies' points take 0.5 GB."""
 
 
-def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> torch.Tensor:
+def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> Tensor:
     """Points [m] and normals of objects' surfaces, even in area [O, count, 6]."""
     rows = []
     for item in objects:
         mesh = trimesh.Trimesh(item.vertices, item.faces, process=False)
         points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-        both = [torch.as_tensor(x, dtype=torch.float32) for x in (points, mesh.face_normals[faces])]
-        rows.append(torch.cat(both, dim=1))
-    return torch.stack(rows).to(device)
+        rows.append(np.concatenate([points, mesh.face_normals[faces]], axis=1))
+    return torch.tensor(np.stack(rows), dtype=torch.float32, device=device)
 
 
-def centred(shapes: torch.Tensor) -> torch.Tensor:
-    """Shapes [O, P, 6] about the means of their points."""
-    mean = shapes[..., :3].mean(dim=1, keepdim=True)
-    return torch.cat([shapes[..., :3] - mean, shapes[..., 3:]], dim=-1)
+def centred_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> Tensor:
+    """As :func:`mesh_points`, about the means of the points."""
+    shapes = mesh_points(objects, count, device)
+    shapes[..., :3] -= shapes[..., :3].mean(dim=1, keepdim=True)
+    return shapes
 
 
 class ShapeBank:
@@ -35,14 +39,18 @@ class ShapeBank:
     Some are replaced every so often.
 
     Args:
-        meshes: Points and normals of objects [O, P', 6].
+        objects: The meshes.
         count: K.
         points: P, points of each.
+        device: Torch device.
     """
 
-    def __init__(self, meshes: torch.Tensor, count: int, points: int) -> None:
-        self._meshes, self._oldest = meshes, 0
-        self._shapes = torch.empty((count, points, 6), dtype=torch.half, device=meshes.device)
+    def __init__(
+        self, objects: Sequence[ObjectModel], count: int, points: int, device: torch.device
+    ) -> None:
+        self._meshes = centred_points(objects, max(MESH_POINTS, points), device)
+        self._oldest = 0
+        self._shapes = torch.empty((count, points, 6), dtype=torch.half, device=device)
         self.renew(count)
 
     def renew(self, count: int) -> None:
@@ -55,8 +63,10 @@ class ShapeBank:
             shapes = torch.cat([made, mesh_shapes(self._meshes, some - half, points)])
             rows = (self._oldest + torch.arange(some, device=shapes.device)) % size
             self._shapes[rows] = shapes.half()
-            self._oldest, count = (self._oldest + some) % size, count - some
+            self._oldest = (self._oldest + some) % size
+            count -= some
 
-    def draw(self, count: int) -> torch.Tensor:
+    def draw(self, count: int) -> Tensor:
         """Points [m] and normals of shapes drawn at random [count, P, 6]."""
-        return self._shapes[torch.randint(len(self._shapes), (count,), device=self._shapes.device)]
+        rows = torch.randint(len(self._shapes), (count,), device=self._shapes.device)
+        return self._shapes[rows]

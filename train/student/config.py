@@ -10,7 +10,7 @@ import tyro
 from vd.evaluate.conditions import OBSERVATION_LATENCY_S
 from vd.paper import PAPER
 from vd.sensors.cfg import LATENCY_S
-from vd.train.config import RunCfg, require
+from vd.train.config import RunCfg, StageTaskCfg, require
 from vd.train.presets import SMOKE_RUN
 from vd.vision.cfg import StudentCfg
 
@@ -77,8 +77,6 @@ class CloudsCfg:
     """Stage 0: random postures of the hand; 0.15 GB."""
     updates: int = 50
     """Stage 0: optimiser steps of an iteration."""
-    validation: tuple[str, ...] = ()
-    """Stage 0: object sets to measure on, names or folders, that are not learned from."""
     validate_every: int = 20
     """Stage 0: iterations from one measurement to the next."""
 
@@ -106,18 +104,6 @@ class SimulatedCfg:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
         require(self, "--simulated.", "positive", "epochs blank_steps")
         require(self, "--simulated.", "in [0, 1]", "blank_probability")
-
-
-@dataclass
-class StudentTaskCfg:
-    """The environments; all else of them is as in the teacher's training, without its noise."""
-
-    objects: tuple[str, ...] = ()
-    """Object sets: names or folders of object USDs; the teacher's by default."""
-    num_envs: int = 2048
-    """Environments simulated side by side, in stages 1 and 2."""
-    seed: int = 0
-    """Seed of every random draw."""
 
 
 @dataclass
@@ -150,7 +136,7 @@ class StudentTrainCfg:
     learn: LearnCfg = field(default_factory=LearnCfg)
     clouds: CloudsCfg = field(default_factory=CloudsCfg)
     simulated: SimulatedCfg = field(default_factory=SimulatedCfg)
-    task: StudentTaskCfg = field(default_factory=StudentTaskCfg)
+    task: StageTaskCfg = field(default_factory=StageTaskCfg)
 
     def validate(self) -> None:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
@@ -159,8 +145,7 @@ class StudentTrainCfg:
         self.learn.validate()
         self.clouds.validate()
         self.simulated.validate()
-        require(self.task, "--", "positive", "num_envs")
-        require(self.task, "--", "zero or positive", "seed")
+        self.task.validate()
 
 
 def gpu(stage: Stage) -> StudentTrainCfg:
@@ -170,7 +155,7 @@ def gpu(stage: Stage) -> StudentTrainCfg:
         stage=stage,
         run=RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000),
         learn=LearnCfg(precision="bf16", window=8 if stage == MADE else 16),
-        task=StudentTaskCfg(num_envs=1024 if stage == RENDERED else 2048),
+        task=StageTaskCfg(num_envs=1024 if stage == RENDERED else 2048),
     )
 
 
@@ -198,7 +183,7 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         ),
         learn=LearnCfg(window=8, batch=8, learning_rate=1e-3, warmup_steps=20),
         clouds=CloudsCfg(shapes=64, hands=32, updates=10, validate_every=10),
-        task=StudentTaskCfg(num_envs=16),
+        task=StageTaskCfg(num_envs=16),
     )
 
 

@@ -10,22 +10,21 @@ from operator import itemgetter
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.policy.senses import Senses
-from vd.train.student.bank import ShapeBank, centred, mesh_points
+from vd.train.student.bank import ShapeBank, centred_points
 from vd.train.student.config import StudentTrainCfg
 from vd.train.student.sequences import Sequences, inputs_of, last_errors
 from vd.train.student.shapes import random_matrices, uniform
-from vd.train.student.views import Hands, camera_points, goal_points
+from vd.train.student.views import Hands, camera_points, goal_points, posed
 from vd.vision.acting import ActingStudent
-from vd.vision.rotations import matrices, rotations_about, two_columns
+from vd.vision.rotations import matrices_about
 from vd.vision.student import Belief, carried, each
 
 CLOUDS = 4
 """Points of a shape, in clouds: one is the goal's, of the others is seen what is to be seen."""
-MESH_POINTS = 6000
-"""Points kept of a mesh: of them each deformed copy draws its own."""
 SHIFT_M = 0.04
 """First beliefs are off by up to this along each axis [m]."""
 TURN_RAD, MOVE_M = 0.25, 0.003
@@ -36,12 +35,12 @@ LEFT, WIDER = 0.5, 1.05
 """Where no more than this share of the error is left after a sequence, the largest grows so."""
 
 
-def turned(rotation: torch.Tensor, most: float) -> torch.Tensor:
+def turned(rotation: Tensor, most: float) -> Tensor:
     """Rotations [B, 3, 3] turned about any axis by angles that are uniform up to ``most`` [rad]."""
     count = len(rotation)
     axis = torch.randn((count, 3), device=rotation.device)
     angle = most * torch.rand(count, device=rotation.device)
-    return matrices(two_columns(rotations_about(axis, angle))) @ rotation
+    return matrices_about(axis, angle) @ rotation
 
 
 class MadeSequences:
@@ -72,12 +71,11 @@ class MadeSequences:
         self.samples = cfg.clouds.updates * cfg.learn.batch * cfg.learn.window
         points = CLOUDS * cfg.clouds.points
         device = hands.eye.device
-        meshes = centred(mesh_points(objects, max(MESH_POINTS, points), device))
-        self._bank = ShapeBank(meshes, cfg.clouds.shapes, points)
+        self._bank = ShapeBank(objects, cfg.clouds.shapes, points, device)
         self.most_rad = FIRST_TURN_RAD
         self._held_out = None
         if held_out:
-            self._held_out = centred(mesh_points(held_out, points, device))
+            self._held_out = centred_points(held_out, points, device)
 
     def minibatches(
         self, acting: ActingStudent, stopping: Callable[[], bool]
@@ -95,9 +93,7 @@ class MadeSequences:
             self.most_rad = min(math.pi, WIDER * self.most_rad)
 
     @torch.no_grad()
-    def draw(
-        self, acting: ActingStudent, shapes: torch.Tensor, most_rad: float = math.pi
-    ) -> Sequences:
+    def draw(self, acting: ActingStudent, shapes: Tensor, most_rad: float = math.pi) -> Sequences:
         """Sequences of shapes, points [m] and normals [B, P, 6], with the student's own beliefs.
 
         The first are off by up to ``most_rad``.
@@ -110,8 +106,8 @@ class MadeSequences:
         goal = goal_points(shapes[..., :3], self._clouds.points, self._clouds.scan_share)
         acting.build.set_goals(goal)
         place = self._motion(count)
-        begin = carried(shapes[..., :3], place.rotation[0], place.position[0, :, None])
-        posture = self._hands.holding(begin)
+        begin = posed(shapes, place.rotation[0], place.position[0])
+        posture = self._hands.holding(begin[..., :3])
         points = self._seen(shapes[:, self._clouds.points :], place, posture)
         middle = carried(goal.mean(dim=1, keepdim=True), place.rotation)[..., 0, :]
         truth = Belief(place.rotation, place.position + middle)
@@ -152,12 +148,12 @@ class MadeSequences:
         return {"learn/most_rad": self.most_rad}
 
     @torch.no_grad()
-    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+    def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
         """Errors after a sequence of objects that are not learned from."""
         if self._held_out is None:
             return {}
-        shapes = self._held_out
-        sequences = self.draw(acting, shapes.repeat(1 + self._learn.batch // len(shapes), 1, 1))
+        views = 1 + self._learn.batch // len(self._held_out)
+        sequences = self.draw(acting, self._held_out.repeat(views, 1, 1))
         turn, shift = last_errors(acting.belief, sequences)
         return {
             "validation/rotation_error": turn.median(),
@@ -178,9 +174,8 @@ class MadeSequences:
     def _motion(self, count: int) -> Belief:
         """Where shapes are in each step, base frame [T, B]."""
         device = self._hands.eye.device
-        low, high = self._hands.box
         rotation = random_matrices(count, device)
-        position = low + (high - low) * torch.rand((count, 3), device=device)
+        position = uniform(*self._hands.box, count, 3, device=device)
         rotations = []
         positions = []
         for _ in range(self._learn.window):
@@ -190,20 +185,14 @@ class MadeSequences:
             position = position + MOVE_M * torch.randn_like(position)
         return Belief(torch.stack(rotations), torch.stack(positions))
 
-    def _seen(self, shapes: torch.Tensor, place: Belief, posture: torch.Tensor) -> torch.Tensor:
+    def _seen(self, shapes: Tensor, place: Belief, posture: Tensor) -> Tensor:
         """Points that a camera sees of shapes [B, P, 6] in each step, or whole surfaces [T, B, K, 3]."""
         steps, count = place.position.shape[:2]
         wanted = self._clouds.points
         device = shapes.device
-        posed = torch.cat(
-            [
-                carried(shapes[..., :3], place.rotation, place.position[..., None, :]),
-                carried(shapes[..., 3:], place.rotation),
-            ],
-            dim=-1,
-        ).flatten(0, 1)
-        seen = camera_points(self._hands, posture.repeat(steps), posed, wanted)
-        whole = posed[:, :wanted, :3]
+        surfaces = posed(shapes, place.rotation, place.position).flatten(0, 1)
+        seen = camera_points(self._hands, posture.repeat(steps), surfaces, wanted)
+        whole = surfaces[:, :wanted, :3]
         whole = whole + self._clouds.noise_m * torch.randn_like(whole)
         by_camera = torch.rand((count, 1, 1), device=device) < self._clouds.seen_share
         points = torch.where(by_camera.repeat(steps, 1, 1), seen, whole)

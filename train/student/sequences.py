@@ -3,15 +3,12 @@
 T steps, B sequences, N environments, D actions.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
 
-import torch
+from torch import Tensor
 
 from vd.policy.senses import Senses
 from vd.train.student.config import LearnCfg
-from vd.vision.acting import ActingStudent
 from vd.vision.rotations import chord, turn_angle
 from vd.vision.student import Belief, InputBuilder, StudentInput, StudentOutput, each
 
@@ -27,52 +24,15 @@ class Sequences:
     """What was read in each step, with what was believed then [T, B]."""
     truth: Belief
     """What was to be believed [T, B]."""
-    hidden: torch.Tensor
+    hidden: Tensor
     """Memory before the first step [B, G]."""
-    done: torch.Tensor
+    done: Tensor
     """Whether an episode ended with a step, bool [T, B]."""
-    label: torch.Tensor | None = None
+    label: Tensor | None = None
     """What the teacher does [T, B, D]; None: there is no teacher."""
 
 
-class SequenceSource(Protocol):
-    """Where sequences come from: one of the stages."""
-
-    samples: int
-    """Steps of an iteration, over all sequences."""
-    env: Any
-    """The environments behind rsl-rl's interface; None without simulation."""
-
-    def minibatches(
-        self, acting: ActingStudent, stopping: Callable[[], bool]
-    ) -> Iterator[Sequences]:
-        """The sequences of an iteration, one optimiser step each; fewer where it is to stop."""
-        ...
-
-    def figures(self) -> dict[str, Any]:
-        """What else is to be logged of the iteration."""
-        ...
-
-    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
-        """Errors on what is not learned from; empty for none."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """What is needed to go on exactly, but for environments and torch's random state."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over :meth:`state_dict`."""
-        ...
-
-    def close(self) -> None:
-        """Release the environments."""
-        ...
-
-
-def inputs_of(
-    build: InputBuilder, senses: Senses, belief: Belief, rows: torch.Tensor
-) -> StudentInput:
+def inputs_of(build: InputBuilder, senses: Senses, belief: Belief, rows: Tensor) -> StudentInput:
     """What was read in T steps of the environments ``rows`` [B], made again [T, B].
 
     Args:
@@ -88,23 +48,21 @@ def inputs_of(
     return each(sight, lambda value: value.unflatten(0, (steps, len(rows))))
 
 
-def belief_errors(belief: Belief, truth: Belief) -> tuple[torch.Tensor, torch.Tensor]:
+def belief_errors(belief: Belief, truth: Belief) -> tuple[Tensor, Tensor]:
     """Angles [rad] and distances [m] by which beliefs are wrong [..]."""
-    turn = belief.rotation.transpose(-1, -2) @ truth.rotation
+    turn = belief.rotation.mT @ truth.rotation
     return turn_angle(turn), (belief.position - truth.position).norm(dim=-1)
 
 
-def last_errors(belief: Belief, sequences: Sequences) -> tuple[torch.Tensor, torch.Tensor]:
+def last_errors(belief: Belief, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Angles [rad] and distances [m] by which beliefs after the last step are wrong [B]."""
     return belief_errors(belief, each(sequences.truth, lambda value: value[-1]))
 
 
-def student_losses(
-    output: StudentOutput, sequences: Sequences, cfg: LearnCfg
-) -> dict[str, torch.Tensor]:
+def student_losses(output: StudentOutput, sequences: Sequences, cfg: LearnCfg) -> dict[str, Tensor]:
     """Weighted losses by name, means over all steps."""
     truth = sequences.truth
-    to_goal = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation
+    to_goal = truth.rotation.mT @ sequences.sight.goal_rotation
     distance = turn_angle(to_goal).clamp(min=LEAST_DISTANCE_RAD)
     shift = (output.belief.position - truth.position).norm(dim=-1)
     losses = {

@@ -12,9 +12,10 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 from torch.nn.functional import normalize
 
-from vd.vision.rotations import matrices, random_rotations, two_columns
+from vd.vision.rotations import quaternion_matrices, random_rotations
 
 BODIES = 5
 """Bodies of a shape at most: cups, tools and figures of a few parts are among the unions of so
@@ -58,17 +59,17 @@ TINY = 1e-4
 """Relative distance under a surface that counts as on it."""
 
 
-def uniform(low: float, high: float, *shape: int, device: torch.device) -> torch.Tensor:
+def uniform(low: float | Tensor, high: float | Tensor, *shape: int, device: torch.device) -> Tensor:
     """Numbers uniform in a range, of a shape."""
     return low + (high - low) * torch.rand(shape, device=device)
 
 
-def random_matrices(count: int, device: torch.device) -> torch.Tensor:
+def random_matrices(count: int, device: torch.device) -> Tensor:
     """Rotation matrices uniform on SO(3) [count, 3, 3]."""
-    return matrices(two_columns(random_rotations(count, device)))
+    return quaternion_matrices(random_rotations(count, device))
 
 
-def drawn(weights: torch.Tensor, count: int) -> torch.Tensor:
+def drawn(weights: Tensor, count: int) -> Tensor:
     """Columns drawn in proportion to weights [K, P], with repetition: indices [K, count].
 
     By the running sum: ``torch.multinomial`` takes several times as long.
@@ -82,45 +83,48 @@ def drawn(weights: torch.Tensor, count: int) -> torch.Tensor:
 class Bodies:
     """K bodies, each a superquadric or a torus, about their own centres and axes."""
 
-    half: torch.Tensor
+    half: Tensor
     """Half axes of superquadrics [K, 3]."""
-    exponents: torch.Tensor
+    exponents: Tensor
     """Their exponents: along z, and around it [K, 2]."""
-    ring: torch.Tensor
+    ring: Tensor
     """Which are tori about z instead [K]."""
-    radii: torch.Tensor
+    radii: Tensor
     """Radii of tori: of the ring, and of the tube [K, 2]."""
-    turn: torch.Tensor
+    turn: Tensor
     """From their axes to the shape's [K, 3, 3]."""
-    centre: torch.Tensor
+    centre: Tensor
     """In the shape's axes [K, 3]."""
 
-    def level(self, points: torch.Tensor) -> torch.Tensor:
+    def level(self, points: Tensor) -> Tensor:
         """How far out points [K, P, 3] of the shape's axes are.
 
         0 on the surface, -1 in the middle [K, P].
         """
         own = (points - self.centre[:, None]) @ self.turn
-        radius = (
-            (own[..., :2].norm(dim=-1) - self.radii[:, :1]).square() + own[..., 2].square()
-        ).sqrt()
+        ring, tube = self.radii.split(1, dim=1)
+        beside = own[..., :2].norm(dim=-1) - ring
+        radius = (beside.square() + own[..., 2].square()).sqrt()
         value, _ = _superquadric(own / self.half[:, None], self.exponents)
         quadric = value ** (0.5 * self.exponents[:, :1])
-        return torch.where(self.ring[:, None], radius / self.radii[:, 1:], quadric) - 1.0
+        return torch.where(self.ring[:, None], radius / tube, quadric) - 1.0
 
-    def sample(self, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def sample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Points of the surfaces and normals [K, count, 3], and the area each stands for [K, count]."""
-        quadric, torus = self._quadric_points(count), self._torus_points(count)
+        quadric = self._quadric_points(count)
+        torus = self._torus_points(count)
         ring = self.ring[:, None]
-        points, normals = (torch.where(ring[..., None], torus[i], quadric[i]) for i in range(2))
-        back = self.turn.transpose(-1, -2)
+        points = torch.where(ring[..., None], torus[0], quadric[0])
+        normals = torch.where(ring[..., None], torus[1], quadric[1])
         area = torch.where(ring, torus[2], quadric[2])
+        back = self.turn.mT
         return points @ back + self.centre[:, None], normals @ back, area
 
-    def _quadric_points(self, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _quadric_points(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Where rays from the middle meet the surface; a ray stands for its solid angle."""
-        half, device = self.half[:, None], self.half.device
-        ray = normalize(torch.randn((len(half), count, 3), device=device), dim=-1) * half
+        half = self.half[:, None]
+        direction = torch.randn((len(half), count, 3), device=half.device)
+        ray = normalize(direction, dim=-1) * half
         length = ray.norm(dim=-1)
         ray = ray / length[..., None]
         value, _ = _superquadric(ray / half, self.exponents)
@@ -133,19 +137,18 @@ class Bodies:
         cosine = (normals * ray).sum(dim=-1).clamp_min(0.05)
         return points, normals, 4.0 * math.pi * angle * reach.square() / cosine
 
-    def _torus_points(self, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _torus_points(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Points at angles about the ring and the tube."""
-        ring, tube = self.radii[:, :1], self.radii[:, 1:]
+        ring, tube = self.radii.split(1, dim=1)
         about, around = uniform(0.0, 2.0 * math.pi, 2, len(ring), count, device=ring.device)
-        out = torch.stack(
-            (around.cos() * about.cos(), around.cos() * about.sin(), around.sin()), dim=-1
-        )
-        middle = torch.stack((about.cos(), about.sin(), torch.zeros_like(about)), dim=-1)
-        points = ring[..., None] * middle + tube[..., None] * out
-        return points, out, 4.0 * math.pi**2 * tube * (ring + tube * around.cos())
+        outwards = torch.stack([about.cos(), about.sin(), torch.zeros_like(about)], dim=-1)
+        normals = around.cos()[..., None] * outwards
+        normals[..., 2] = around.sin()
+        points = ring[..., None] * outwards + tube[..., None] * normals
+        return points, normals, 4.0 * math.pi**2 * tube * (ring + tube * around.cos())
 
 
-def _superquadric(x: torch.Tensor, exponents: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _superquadric(x: Tensor, exponents: Tensor) -> tuple[Tensor, Tensor]:
     """The implicit function of points in units of half axes [K, P, 3], and the direction of its gradient.
 
     It is 1 on the surface. Of x and y the larger is taken out of powers, which would leave single
@@ -154,14 +157,18 @@ def _superquadric(x: torch.Tensor, exponents: torch.Tensor) -> tuple[torch.Tenso
     along, around = 2.0 / exponents[:, :1], 2.0 / exponents[:, 1:]
     size = x.abs().clamp_min(1e-6)
     larger = size[..., :2].amax(dim=-1)
-    x1, y1, z1 = size[..., 0] / larger, size[..., 1] / larger, size[..., 2]
+    x1 = size[..., 0] / larger
+    y1 = size[..., 1] / larger
+    z1 = size[..., 2]
     both = x1**around + y1**around
     value = both ** (along / around) * larger**along + z1**along
     flat = both ** (along / around - 1.0) * larger ** (along - 1.0)
-    slope = torch.stack(
-        (flat * x1 ** (around - 1.0), flat * y1 ** (around - 1.0), z1 ** (along - 1.0)), dim=-1
-    )
-    return value, slope * x.sign()
+    slopes = [
+        flat * x1 ** (around - 1.0),
+        flat * y1 ** (around - 1.0),
+        z1 ** (along - 1.0),
+    ]
+    return value, torch.stack(slopes, dim=-1) * x.sign()
 
 
 def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
@@ -176,20 +183,19 @@ def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
     half = uniform(low, high, count, 3, device=device).exp() * (1.0 if place else FIRST_GROWN)
     exponents = uniform(*ROUND_EXPONENTS, count, 2, device=device)
     boxes = torch.rand((count, 2), device=device) < 0.5
-    radii = [uniform(*limits, count, device=device) for limits in (RING_RADII, TUBE_RADII)]
+    ring = uniform(*RING_RADII, count, device=device)
+    tube = uniform(*TUBE_RADII, count, device=device)
     return Bodies(
         half,
         torch.where(boxes, BOX_EXPONENT, exponents),
         torch.rand(count, device=device) < TORI[min(place, 1)],
-        torch.stack(radii, dim=1),
+        torch.stack([ring, tube], dim=1),
         random_matrices(count, device),
         torch.zeros((count, 3), device=device),
     )
 
 
-def _parts(
-    count: int, device: torch.device
-) -> tuple[list[Bodies], list[torch.Tensor], torch.Tensor]:
+def _parts(count: int, device: torch.device) -> tuple[list[Bodies], list[Tensor], Tensor]:
     """The bodies of shapes, their points, normals and areas [K, P, 3 + 3 + 1], and how many count [K].
 
     Each body is about a point of one before it. Half have the first one's axes, as things that are
@@ -197,23 +203,24 @@ def _parts(
     """
     number = torch.randint(1, BODIES + 1, (count,), device=device)
     bodies: list[Bodies] = []
-    samples: list[torch.Tensor] = []
+    samples: list[Tensor] = []
     for place in range(BODIES):
         body = random_bodies(count, place, device)
         if place:
             same = torch.rand((count, 1, 1), device=device) < 0.5
             earlier = torch.stack(samples, dim=1)[..., :3]
             rows = torch.arange(count, device=device)
-            of = torch.randint(place, (count,), device=device).minimum(number - 1)
-            centre = earlier[rows, of, torch.randint(CANDIDATES, (count,), device=device)]
-            body = replace(body, turn=torch.where(same, bodies[0].turn, body.turn), centre=centre)
+            parent = torch.randint(place, (count,), device=device).minimum(number - 1)
+            point = torch.randint(CANDIDATES, (count,), device=device)
+            turn = torch.where(same, bodies[0].turn, body.turn)
+            body = replace(body, turn=turn, centre=earlier[rows, parent, point])
         points, normals, area = body.sample(CANDIDATES)
         bodies.append(body)
         samples.append(torch.cat([points, normals, area[..., None]], dim=-1))
     return bodies, samples, number
 
 
-def unions(count: int, points: int, device: torch.device) -> torch.Tensor:
+def unions(count: int, points: int, device: torch.device) -> Tensor:
     """Unions of bodies, some hollowed, at their own size: points and normals [count, points, 6]."""
     bodies, samples, number = _parts(count, device)
     first = bodies[0]
@@ -223,22 +230,20 @@ def unions(count: int, points: int, device: torch.device) -> torch.Tensor:
     hollow = replace(first, half=narrow * first.half, centre=first.centre + shift)
     inner, inwards, area = hollow.sample(CANDIDATES)
     samples.append(torch.cat([inner, -inwards, area[..., None]], dim=-1))
+    there = [(number > place)[:, None] for place in range(BODIES)] + [hollowed[:, None]]
     outside = []
     for place, sample in enumerate(samples):
         at = sample[..., :3]
-        free = (
-            (number > place)[:, None]
-            if place < BODIES
-            else hollowed[:, None] & (first.level(at) < 0.0)
-        )
-        for other, body in enumerate(bodies):
-            if other != place and not (place == BODIES and other == 0):
-                free = free & ~((body.level(at) < -TINY) & (number > other)[:, None])
-        if place < BODIES:
-            free = free & ~((hollow.level(at) < -TINY) & hollowed[:, None])
+        free = there[place]
+        for other, body in enumerate([*bodies, hollow]):
+            if place == BODIES and other == 0:  # the wall of a hollow is inside of its body
+                free = free & (body.level(at) < 0.0)
+            elif other != place:
+                free = free & ~((body.level(at) < -TINY) & there[other])
         outside.append(free)
     everything = torch.cat(samples, dim=1)
-    index = drawn(everything[..., 6] * torch.cat(outside, dim=1), points)
+    area = everything[..., 6] * torch.cat(outside, dim=1)
+    index = drawn(area, points)
     return everything[..., :6].take_along_dim(index[..., None], dim=1)
 
 
@@ -246,24 +251,24 @@ def unions(count: int, points: int, device: torch.device) -> torch.Tensor:
 class Deformation:
     """Smooth maps of space, one of each of K shapes whose size is about 1."""
 
-    turn: torch.Tensor
+    turn: Tensor
     """Axes in which they deform [K, 3, 3]."""
-    scale: torch.Tensor
+    scale: Tensor
     """Uneven scale [K, 3]."""
-    taper: torch.Tensor
+    taper: Tensor
     """Growth across x per unit of x [K]."""
-    twist: torch.Tensor
+    twist: Tensor
     """About x [rad per unit] [K]."""
-    bend: torch.Tensor
+    bend: Tensor
     """Curvature of the x axis in the xy plane [1 / unit] [K]."""
-    waves: torch.Tensor
+    waves: Tensor
     """Three waves: amplitudes, wave numbers, phases (of which the first is used) [K, 3, 3, 3]."""
 
     @staticmethod
     def draw(count: int, strength: float, device: torch.device) -> "Deformation":
         """Random ones; half of the shapes are not tapered, bent or waved at all, most are not twisted."""
 
-        def sometimes(share: float, most: float, *shape: int) -> torch.Tensor:
+        def sometimes(share: float, most: float, *shape: int) -> Tensor:
             on = torch.rand((count, *(1 for _ in shape)), device=device) < share
             return uniform(-most * strength, most * strength, count, *shape, device=device) * on
 
@@ -281,44 +286,44 @@ class Deformation:
             torch.stack(waves, dim=1),
         )
 
-    def __call__(self, points: torch.Tensor) -> torch.Tensor:
+    def __call__(self, points: Tensor) -> Tensor:
         """Points [K, P, 3] where they come to lie."""
-        x, y, z = (points @ self.turn.transpose(-1, -2) * self.scale[:, None]).unbind(-1)
+        x, y, z = (points @ self.turn.mT * self.scale[:, None]).unbind(-1)
         wider = (1.0 + self.taper[:, None] * x).clamp_min(0.3)  # never inside out
-        y, z = wider * y, wider * z
+        y = wider * y
+        z = wider * z
         angle = self.twist[:, None] * x
-        y, z = y * angle.cos() - z * angle.sin(), y * angle.sin() + z * angle.cos()
+        turned = y * angle.cos() - z * angle.sin()
+        z = y * angle.sin() + z * angle.cos()
+        y = turned
         # By sin(a) / a, which has no pole where nothing is bent.
         angle = self.bend[:, None] * x
         along = x * torch.sinc(angle / math.pi) - y * angle.sin()
         across = 0.5 * x * angle * torch.sinc(0.5 * angle / math.pi).square() + y * angle.cos()
         bent = torch.stack((along, across, z), dim=-1)
         amplitude, number, phase = self.waves.unbind(1)
-        height = torch.sin(
-            bent @ number.transpose(-1, -2) + phase[:, None, :, 0]
-        )  # [K, P, 3 waves]
-        return bent + height @ amplitude
+        angle = bent @ number.mT + phase[:, None, :, 0]  # [K, P, 3 waves]
+        return bent + torch.sin(angle) @ amplitude
 
 
-def deformed(shapes: torch.Tensor, deformation: Deformation) -> torch.Tensor:
+def deformed(shapes: Tensor, deformation: Deformation) -> Tensor:
     """Points and normals [K, P, 6] after a deformation.
 
     The tangents at each point are deformed with it.
     """
     points, normals = shapes[..., :3], shapes[..., 3:]
     x, y = torch.eye(3, device=shapes.device)[:2]
-    across = normalize(
-        torch.linalg.cross(normals, torch.where(normals[..., :1].abs() < 0.7, x, y)), dim=-1
-    )
+    other = torch.where(normals[..., :1].abs() < 0.7, x, y)
+    across = normalize(torch.linalg.cross(normals, other), dim=-1)
+    along = torch.linalg.cross(normals, across)
     at = deformation(points)
-    tangents = [
-        deformation(points + TANGENT * tangent) - at
-        for tangent in (across, torch.linalg.cross(normals, across))
-    ]
-    return torch.cat([at, normalize(torch.linalg.cross(*tangents), dim=-1)], dim=-1)
+    across = deformation(points + TANGENT * across) - at
+    along = deformation(points + TANGENT * along) - at
+    normals = normalize(torch.linalg.cross(across, along), dim=-1)
+    return torch.cat([at, normals], dim=-1)
 
 
-def sized(shapes: torch.Tensor) -> torch.Tensor:
+def sized(shapes: Tensor) -> Tensor:
     """Shapes about the mean of their points [m] and of a random size.
 
     Points and normals [K, P, 6].
@@ -326,15 +331,17 @@ def sized(shapes: torch.Tensor) -> torch.Tensor:
     points = shapes[..., :3] - shapes[..., :3].mean(dim=1, keepdim=True)
     longest = (points.amax(dim=1) - points.amin(dim=1)).amax(dim=-1)
     wanted = uniform(*LENGTH_M, len(points), device=points.device)
-    return torch.cat([points * (wanted / longest)[:, None, None], shapes[..., 3:]], dim=-1)
+    points = points * (wanted / longest)[:, None, None]
+    return torch.cat([points, shapes[..., 3:]], dim=-1)
 
 
-def made_shapes(count: int, points: int, device: torch.device) -> torch.Tensor:
+def made_shapes(count: int, points: int, device: torch.device) -> Tensor:
     """Unions of bodies, deformed: points [m] and normals [count, points, 6]."""
-    return sized(deformed(unions(count, points, device), Deformation.draw(count, 1.0, device)))
+    bodies = unions(count, points, device)
+    return sized(deformed(bodies, Deformation.draw(count, 1.0, device)))
 
 
-def mesh_shapes(meshes: torch.Tensor, count: int, points: int) -> torch.Tensor:
+def mesh_shapes(meshes: Tensor, count: int, points: int) -> Tensor:
     """Objects drawn from meshes, deformed.
 
     Args:
@@ -349,5 +356,5 @@ def mesh_shapes(meshes: torch.Tensor, count: int, points: int) -> torch.Tensor:
     rows = torch.randint(len(meshes), (count, 1), device=device)
     columns = torch.randperm(meshes.shape[1], device=device)[:points]
     some = meshes[rows, columns].float()
-    some = torch.cat([some[..., :3] / MESH_UNIT_M, some[..., 3:]], dim=-1)
+    some[..., :3] /= MESH_UNIT_M
     return sized(deformed(some, Deformation.draw(count, MESH_STRENGTH, device)))

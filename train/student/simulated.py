@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from torch import Tensor
 
 from vd.evaluate.tracking import sensed, sensed_with
 from vd.geometry.quaternions import poses_in
@@ -24,7 +25,7 @@ from vd.train.student.sequences import Sequences, belief_errors, inputs_of
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
-from vd.vision.rotations import matrices, two_columns
+from vd.vision.rotations import quaternion_matrices
 from vd.vision.student import Belief, carried, each
 
 
@@ -48,7 +49,7 @@ class SimulatedSequences:
         self,
         env: ReorientVecEnv,
         teacher: TrainedPolicy,
-        surfaces: torch.Tensor,
+        surfaces: Tensor,
         cfg: StudentTrainCfg,
         camera: DepthCamera | None = None,
     ):
@@ -60,19 +61,17 @@ class SimulatedSequences:
         env.env.acts_in_frame = False  # who sees by a camera acts in the world
         place = surfaces.device
         scene = env.env.scene
-        objects = torch.tensor(np.asarray(scene.world_object), device=place)
-        self._scale = torch.tensor(
-            np.asarray(scene.world_scale), dtype=torch.float32, device=place
-        )[:, None, None]
+        scale = torch.tensor(np.asarray(scene.world_scale), device=place).float()
+        self._scale = scale[:, None, None]
+        self._object = torch.tensor(np.asarray(scene.world_object), device=place)
         points = cfg.clouds.points
-        self.goals = self._scale * goal_points(surfaces[objects], points, cfg.clouds.scan_share)
+        goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
+        self.goals = self._scale * goals
         self._shapes = surfaces[:, points:]
-        self._object = objects
-        mount = env.env.hand.mount
-        self._base = torch.tensor(mount, dtype=torch.float32, device=place)
-        self._pose = wp.to_torch(env.env.sim.body_q)[:, env.env.scene.object_body]
+        self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
+        self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
-        self._store: dict[str, torch.Tensor] = {}
+        self._store: dict[str, Tensor] = {}
         self._means = StepMeans()
         length = math.ceil(2 * env.max_episode_length / cfg.learn.window)
         self._window = GoalWindow(length)
@@ -91,7 +90,7 @@ class SimulatedSequences:
                 yield self.taken(acting, hidden, rows)
 
     @torch.no_grad()
-    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> torch.Tensor | None:
+    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> Tensor | None:
         """Act for T steps; the memory before the first of them, or None if it was cut short."""
         hidden = acting.hidden
         for step in range(self._cfg.learn.window):
@@ -105,19 +104,22 @@ class SimulatedSequences:
             self._keep(step, senses, acting.belief, pose, label)
             output = acting.decide(sight)
             turn, shift = belief_errors(output.belief, acting.build.belief_of(pose))
+            std = output.log_std.exp()
             noise = torch.randn_like(output.mean)
-            _, _, _, extras = self.env.step(output.mean + output.log_std.exp() * noise)
-            wrong = {
-                "student/rotation_error": turn.mean(),
-                "student/position_error_mm": 1e3 * shift.mean(),
-                "student/action_error": (output.mean - label).abs().mean(),
-                "policy/std": output.log_std.exp().mean(),
-            }
-            self._means.add(wrong | extras["log"])
+            _, _, _, extras = self.env.step(output.mean + std * noise)
+            self._means.add(
+                {
+                    "student/rotation_error": turn.mean(),
+                    "student/position_error_mm": 1e3 * shift.mean(),
+                    "student/action_error": (output.mean - label).abs().mean(),
+                    "policy/std": std.mean(),
+                    **extras["log"],
+                }
+            )
         self.env.env.check()
         return hidden
 
-    def senses(self, pose: torch.Tensor) -> Senses:
+    def senses(self, pose: Tensor) -> Senses:
         """What is sensed now, for true poses of the objects in the base frame [N, 7]."""
         env = self.env.env
         if self._camera is None:
@@ -133,7 +135,7 @@ class SimulatedSequences:
         points = senses.points.half().float()
         return sensed_with(env, points.masked_fill((self.blank > 0)[:, None, None], torch.nan))
 
-    def labels(self) -> torch.Tensor:
+    def labels(self) -> Tensor:
         """What the teacher does now, clipped as the environment clips actions [N, D]."""
         env = self.env.env
         action = self._teacher.act(wp.to_torch(env.observation))
@@ -142,33 +144,28 @@ class SimulatedSequences:
             action = wp.to_torch(env.symmetry_frames.world_action(in_frames))
         return action.clamp(-1.0, 1.0)
 
-    def taken(self, acting: ActingStudent, hidden: torch.Tensor, rows: torch.Tensor) -> Sequences:
+    def taken(self, acting: ActingStudent, hidden: Tensor, rows: Tensor) -> Sequences:
         """What was done in the environments ``rows`` [B]; clouds are made again."""
         kept = {name: values[:, rows] for name, values in self._store.items()}
-        steps = len(kept["pose"])
-        poses = kept["pose"].flatten(0, 1)
+        label = kept.pop("label")
+        belief = Belief(kept.pop("rotation"), kept.pop("position"))
+        pose = kept.pop("pose")
+        steps = len(pose)
+        poses = pose.flatten(0, 1)
         of_poses = rows.repeat(steps)
         if self._camera is None:
             points = self._complete(poses, of_poses).unflatten(0, (steps, len(rows)))
         else:
             points = kept["points"].float()
-        senses = Senses(
-            joint_q=kept["joint_q"],
-            joint_qd=kept["joint_qd"],
-            action=kept["action"],
-            goal_quat=kept["goal_quat"],
-            points=points,
-            fresh=kept["fresh"],
-        )
-        belief = Belief(kept["rotation"], kept["position"])
+        senses = Senses(**(kept | {"points": points}))
+        fresh = kept["fresh"]
         truth = acting.build.belief_of(poses, of_poses)
-        last = torch.zeros_like(kept["fresh"][:1])
         return Sequences(
             sight=inputs_of(acting.build, senses, belief, rows),
             truth=each(truth, lambda value: value.unflatten(0, (steps, len(rows)))),
-            hidden=hidden[rows].masked_fill(kept["fresh"][0, :, None], 0.0),
-            done=torch.cat([kept["fresh"][1:], last]),
-            label=kept["label"],
+            hidden=hidden[rows].masked_fill(fresh[0, :, None], 0.0),
+            done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
+            label=label,
         )
 
     def figures(self) -> dict[str, Any]:
@@ -179,7 +176,7 @@ class SimulatedSequences:
         means = self._means.read(processes)
         return {**self._window.add(means), **means, **self.env.end_iteration()}
 
-    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+    def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
         """Nothing: policies are judged by vd-eval."""
         return {}
 
@@ -204,30 +201,20 @@ class SimulatedSequences:
         """Release the environments."""
         self.env.env.close()
 
-    def _complete(self, pose: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    def _complete(self, pose: Tensor, rows: Tensor) -> Tensor:
         """Points all over the objects of environments ``rows`` at poses [R, 7], with noise [R, K, 3]."""
         clouds = self._cfg.clouds
         order = torch.randperm(self._shapes.shape[1], device=pose.device)[: clouds.points]
         shapes = self._scale[rows] * self._shapes[self._object[rows]][:, order]
-        points = carried(shapes, matrices(two_columns(pose[:, 3:])), pose[:, None, :3])
+        points = carried(shapes, quaternion_matrices(pose[:, 3:]), pose[:, None, :3])
         return points + clouds.noise_m * torch.randn_like(points)
 
-    def _keep(
-        self, step: int, senses: Senses, belief: Belief, pose: torch.Tensor, label: torch.Tensor
-    ) -> None:
+    def _keep(self, step: int, senses: Senses, belief: Belief, pose: Tensor, label: Tensor) -> None:
         """Write a step into the store [T, N, ..]."""
-        values = {
-            "joint_q": senses.joint_q,
-            "joint_qd": senses.joint_qd,
-            "action": senses.action,
-            "goal_quat": senses.goal_quat,
-            "fresh": senses.fresh,
-            "rotation": belief.rotation,
-            "position": belief.position,
-            "pose": pose,
-            "label": label,
-        }
-        if self._camera is not None:
+        values = vars(senses) | vars(belief) | {"pose": pose, "label": label}
+        if self._camera is None:
+            del values["points"]  # they are made again
+        else:
             values["points"] = senses.points.half()
         for name, value in values.items():
             if name not in self._store:

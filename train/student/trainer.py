@@ -4,21 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch import Tensor
 
 from vd.command.config import to_dict
 from vd.policy.bundle import write_policy
 from vd.policy.contract import Contract
 from vd.train.checkpoint import POLICY_NAME
-from vd.train.loop import check_update
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, SequenceSource, last_errors, student_losses
+from vd.train.student.made import MadeSequences
+from vd.train.student.sequences import Sequences, last_errors, student_losses
+from vd.train.student.simulated import SimulatedSequences
 from vd.train.supervised import SupervisedLoop
 from vd.vision.acting import ActingStudent, StudentPolicy
 from vd.vision.student import Belief, Student, each
-
-LOWER_RATES = "lower --learn.learning-rate, or take --learn.precision fp32"
-"""Remedy for a network that diverges."""
 
 
 class StudentTrainer(SupervisedLoop):
@@ -40,7 +38,7 @@ class StudentTrainer(SupervisedLoop):
     def __init__(
         self,
         acting: ActingStudent,
-        source: SequenceSource,
+        source: MadeSequences | SimulatedSequences,
         cfg: StudentTrainCfg,
         *,
         contract: Contract,
@@ -49,8 +47,8 @@ class StudentTrainer(SupervisedLoop):
         super().__init__(
             acting.network,
             cfg.run,
-            learning_rate=cfg.learn.learning_rate,
-            warmup_steps=cfg.learn.warmup_steps,
+            cfg.learn,
+            measure_every=cfg.clouds.validate_every,
             task=contract.task,
             device=device,
             env=source.env,
@@ -66,44 +64,37 @@ class StudentTrainer(SupervisedLoop):
 
     def _iterate(self) -> dict[str, Any] | None:
         done = self._done()
-        rows = []
+        steps = []
         self.network.eval()
         for sequences in self.source.minibatches(self.acting, self._stopping):
-            rows.append(self._step(sequences, done))
+            steps.append(self._step(sequences, done))
             self.network.eval()
-        if not rows or self._stopping():
+        if not steps or self._stopping():
             return None
         self._share_statistics()
-        figures = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
-        count = self.iteration + 1
-        if count % self.cfg.clouds.validate_every == 0 or count == self.total_iterations:
-            figures |= self.source.measure(self.acting)
-        read = self._read(figures)
-        check_update(read, self.network, LOWER_RATES)
-        return read | self.source.figures()
+        return self._figures(steps) | self.source.figures()
 
-    def _step(self, sequences: Sequences, done: float) -> dict[str, torch.Tensor]:
+    def measure(self) -> dict[str, Tensor]:
+        """Errors on what is not learned from; empty for none."""
+        return self.source.measure(self.acting)
+
+    def _step(self, sequences: Sequences, done: float) -> dict[str, Tensor]:
         """One optimiser step; its losses and errors."""
         self.network.train()
         output = self.network(sequences.sight, sequences.hidden, sequences.done)
         losses = student_losses(output, sequences, self.cfg.learn)
-        norm = self._descend(torch.stack(tuple(losses.values())).sum(), done)
+        logged = self._descend(losses, done)
         last = each(output.belief, lambda value: value[-1].detach())
         turn, shift = last_errors(last, sequences)
-        logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
-        logged["loss/grad_norm"] = norm
         logged["learn/rotation_error"] = turn.mean()
         logged["learn/position_error_mm"] = 1e3 * shift.mean()
         return logged
 
     def _share_statistics(self) -> None:
         """Average the batch norms' running statistics over the processes."""
-        if not self.is_distributed:
-            return
         for value in self.network.buffers():
             if value.is_floating_point():
-                torch.distributed.all_reduce(value)
-                value /= self.world_size
+                self._average(value)
 
     def _shared_state(self) -> dict[str, Any]:
         return super()._shared_state() | {"contract": to_dict(self.contract)}
@@ -111,9 +102,8 @@ class StudentTrainer(SupervisedLoop):
     def _process_state(self) -> dict[str, Any]:
         state = super()._process_state() | {"source": self.source.state_dict()}
         if self.env is not None:
-            believed = {"rotation": self.acting.belief.rotation}
-            believed["position"] = self.acting.belief.position
-            state |= {"belief": believed, "hidden": self.acting.hidden}
+            state["belief"] = vars(self.acting.belief)
+            state["hidden"] = self.acting.hidden
         return state
 
     def _restore_process(self, state: dict[str, Any]) -> None:

@@ -8,12 +8,13 @@ postures: in a batch nothing of a hand is left to do but a look into its tables.
 B pairs, P points of a shape, M postures of the hand. All is in the hand's base frame, in metres.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
@@ -21,7 +22,8 @@ from vd.evaluate.scanned import MISSING, NOISE_M
 from vd.geometry.arrays import as_warp
 from vd.geometry.clouds import HandCloud
 from vd.train.student.shapes import drawn, random_matrices, uniform
-from vd.vision.rotations import matrices, rotations_about, two_columns
+from vd.vision.rotations import matrices_about
+from vd.vision.student import carried
 
 OBJECT_RANGE_M = ((-0.06, 0.06), (-0.06, 0.06), (0.02, 0.16))
 """Where objects are, world frame: from the table to the palm, as wide as the claw opens."""
@@ -66,15 +68,15 @@ POSTURES_AT_ONCE = 128
 class Pairs:
     """Clouds about their means, in the base frame's axes, and how they lie."""
 
-    goal: torch.Tensor
+    goal: Tensor
     """[m] [B, G, 3]."""
-    seen: torch.Tensor
+    seen: Tensor
     """[m] [B, G, 3]."""
-    rotation: torch.Tensor
+    rotation: Tensor
     """From goals to objects, matrices [B, 3, 3]."""
-    offset: torch.Tensor
+    offset: Tensor
     """Where the goal's mean lies on the object, from the mean of what is seen [m] [B, 3]."""
-    surface: torch.Tensor
+    surface: Tensor
     """The whole shape, turned as the goal is and about its mean [m] [B, P, 3]."""
 
 
@@ -95,7 +97,7 @@ class Hands:
         place = torch.device(wp.device_to_torch(device))
         eye = hand.camera.at(camera)
 
-        def tensor(values: object) -> torch.Tensor:
+        def tensor(values: object) -> Tensor:
             return torch.tensor(np.asarray(values), dtype=torch.float32, device=place)
 
         corners = np.array(OBJECT_RANGE_M).T
@@ -104,88 +106,75 @@ class Hands:
         self.box = tensor(box)
         """Corners of where objects are [2, 3]."""
         self.count = count
-        self.eye, self._optical = (
-            tensor(eye.position),
-            tensor(Rotation.from_quat(eye.quaternion).as_matrix()),
-        )
+        self.eye = tensor(eye.position)
+        self._optical = tensor(Rotation.from_quat(eye.quaternion).as_matrix())
         middle = (self.box.mean(dim=0) - self.eye) @ self._optical
         self._side = int(2 * WINDOW_M / CELL_M)
         self._cell = CELL_M / middle[2]
         self._corner = middle[:2] / middle[2] - 0.5 * self._side * self._cell
-        self._low = self.box[0] - REACH_M
-        self._voxels = [
-            int(size) for size in ((self.box[1] - self.box[0] + 2 * REACH_M) / TOUCH_M).ceil()
-        ]
         self._depth = torch.empty((count, self.cells), device=place)
-        self._near = torch.zeros(
-            (count, int(np.prod(self._voxels)) + 1), dtype=torch.bool, device=place
-        )
+        self._low = self.box[0] - REACH_M
+        self._voxels = ((self.box[1] - self.box[0] + 2 * REACH_M) / TOUCH_M).ceil().long()
+        _, y, z = self._voxels.tolist()
+        self._strides = torch.tensor([y * z, z, 1], device=place)
+        self._outside = int(self._voxels.prod())
+        self._near = torch.zeros((count, self._outside + 1), dtype=torch.bool, device=place)
         self.joints = random_joints(hand, count, device)
         """Joint positions of the postures [rad] [M, D]."""
         for rows in torch.arange(count, device=place).split(POSTURES_AT_ONCE):
             points = posture_points(hand, self.joints[rows])
             cell, depth = self.project(points)
             self._depth[rows] = nearest(cell, depth, self.cells)
-            voxel = self._voxel(points)
-            near = self._near[rows]
-            self._near[rows] = near.scatter_(1, voxel, torch.ones_like(voxel, dtype=torch.bool))
-        self._depth[:, -1], self._near[:, -1] = torch.inf, False  # what is outside
+            self._near[rows[:, None], self._voxel(points)] = True
+        self._depth[:, -1] = torch.inf  # what is outside
+        self._near[:, -1] = False
 
     @property
     def cells(self) -> int:
         """Cells of a depth map; the last is of all that is outside."""
         return self._side**2 + 1
 
-    def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Cells of a depth map and depths [m] of points, [B, P] each."""
-        x, y, depth = ((points - self.eye) @ self._optical).unbind(-1)
-        across, down = (
-            ((v / depth - low) / self._cell).floor().long()
-            for v, low in zip((x, y), self._corner, strict=True)
-        )
-        inside = (
-            (across >= 0)
-            & (across < self._side)
-            & (down >= 0)
-            & (down < self._side)
-            & (depth > 0.0)
-        )
-        return torch.where(inside, down * self._side + across, self.cells - 1), depth
+        at = (points - self.eye) @ self._optical
+        depth = at[..., 2]
+        place = at[..., :2] / depth[..., None]
+        cell = ((place - self._corner) / self._cell).floor().long()
+        inside = ((cell >= 0) & (cell < self._side)).all(dim=-1) & (depth > 0.0)
+        index = self._side * cell[..., 1] + cell[..., 0]
+        return torch.where(inside, index, self.cells - 1), depth
 
-    def free(
-        self, rows: torch.Tensor, points: torch.Tensor, cell: torch.Tensor, depth: torch.Tensor
-    ) -> torch.Tensor:
+    def free(self, rows: Tensor, points: Tensor, cell: Tensor, depth: Tensor) -> Tensor:
         """Which points [B, P, 3] are neither behind nor beside the hands ``rows`` [B]; [B, P]."""
-        each = rows[:, None]
-        return (depth < self._depth[each, cell]) & ~self._near[each, self._voxel(points)]
+        hand = rows[:, None]
+        before = depth < self._depth[hand, cell]
+        return before & ~self._near[hand, self._voxel(points)]
 
-    def holding(self, points: torch.Tensor) -> torch.Tensor:
+    def holding(self, points: Tensor) -> Tensor:
         """For shapes with points [B, P, 3] hands that are about them, at random [B]."""
         rows = torch.randint(self.count, (len(points), TRIED_HANDS), device=points.device)
-        touched = self._near[rows[:, :, None], self._voxel(points[:, None, :TRIED_POINTS])].sum(
-            dim=-1
-        )
-        return rows.take_along_dim(touched.argmax(dim=1, keepdim=True), dim=1).squeeze(1)
+        voxel = self._voxel(points[:, None, :TRIED_POINTS])
+        touched = self._near[rows[:, :, None], voxel].sum(dim=-1)
+        most = touched.argmax(dim=1, keepdim=True)
+        return rows.take_along_dim(most, dim=1).squeeze(1)
 
-    def _voxel(self, points: torch.Tensor) -> torch.Tensor:
+    def _voxel(self, points: Tensor) -> Tensor:
         """Voxels of points [B, P]; the last is outside."""
-        at = ((points - self._low) / TOUCH_M).floor().long()
-        x, y, z = self._voxels
-        inside = (at >= 0).all(dim=-1) & (at < torch.tensor(self._voxels, device=at.device)).all(
-            dim=-1
-        )
-        return torch.where(inside, (at[..., 0] * y + at[..., 1]) * z + at[..., 2], x * y * z)
+        voxel = ((points - self._low) / TOUCH_M).floor().long()
+        inside = ((voxel >= 0) & (voxel < self._voxels)).all(dim=-1)
+        index = (voxel * self._strides).sum(dim=-1)
+        return torch.where(inside, index, self._outside)
 
 
-def random_joints(hand: HandModel, count: int, device: str) -> torch.Tensor:
+def random_joints(hand: HandModel, count: int, device: str) -> Tensor:
     """Random joint positions within their limits [rad] [count, D]."""
     place = wp.device_to_torch(device)
     lower = torch.tensor(hand.lower, dtype=torch.float32, device=place)
     upper = torch.tensor(hand.upper, dtype=torch.float32, device=place)
-    return lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
+    return uniform(lower, upper, count, len(lower), device=place)
 
 
-def posture_points(hand: HandModel, joints: torch.Tensor) -> torch.Tensor:
+def posture_points(hand: HandModel, joints: Tensor) -> Tensor:
     """The hand's own points at joint positions [rad] [M, D], base frame [m] [M, H, 3]."""
     links = np.arange(len(hand.link_names))
     device = str(as_warp(joints).device)
@@ -195,7 +184,7 @@ def posture_points(hand: HandModel, joints: torch.Tensor) -> torch.Tensor:
     return wp.to_torch(cloud(poses))
 
 
-def nearest(cell: torch.Tensor, depth: torch.Tensor, cells: int) -> torch.Tensor:
+def nearest(cell: Tensor, depth: Tensor, cells: int) -> Tensor:
     """Depth maps [m] [B, cells] of points in cells at depths, [B, P] each.
 
     Infinite where there are none.
@@ -204,7 +193,7 @@ def nearest(cell: torch.Tensor, depth: torch.Tensor, cells: int) -> torch.Tensor
     return empty.scatter_reduce_(1, cell, depth, "amin")
 
 
-def visible(hands: Hands, rows: torch.Tensor, shapes: torch.Tensor) -> torch.Tensor:
+def visible(hands: Hands, rows: Tensor, shapes: Tensor) -> Tensor:
     """Which points a camera sees and tells from the hand [B, P].
 
     Args:
@@ -223,50 +212,57 @@ def visible(hands: Hands, rows: torch.Tensor, shapes: torch.Tensor) -> torch.Ten
     return torch.where(enough, free, facing)
 
 
-def camera_points(
-    hands: Hands, rows: torch.Tensor, shapes: torch.Tensor, count: int
-) -> torch.Tensor:
+def camera_points(hands: Hands, rows: Tensor, shapes: Tensor, count: int) -> Tensor:
     """Points [m] [B, count, 3] that a camera has of shapes, with errors.
 
     Arguments as of :func:`visible`.
     """
-    points, device = shapes[..., :3], shapes.device
+    points = shapes[..., :3]
+    device = shapes.device
     batch = len(points)
     shown = visible(hands, rows, shapes)
+    patches = drawn(shown.float(), LOST_PATCHES)
     kept = shown
-    middles = points[
-        torch.arange(batch, device=device)[:, None], drawn(shown.float(), LOST_PATCHES)
-    ]
-    for middle in middles.unbind(1):
+    for middle in points.take_along_dim(patches[..., None], dim=1).unbind(1):
         radius = LOST_RADIUS_M * torch.rand((batch, 1), device=device)
         kept = kept & ((points - middle[:, None]).norm(dim=-1) > radius)
     kept = torch.where(kept.sum(dim=1, keepdim=True) >= LEAST_SEEN, kept, shown)
-    seen = points.take_along_dim(drawn(kept.float(), count)[..., None], dim=1)
+    chosen = drawn(kept.float(), count)
+    seen = points.take_along_dim(chosen[..., None], dim=1)
     std = DEPTH_STD_M * torch.rand((batch, 1, 1), device=device)
     ray = normalize(seen - hands.eye, dim=-1)
     noise = POINT_STD_M * torch.randn_like(seen)
     return seen + noise + std * torch.randn((batch, count, 1), device=device) * ray
 
 
-def goal_points(points: torch.Tensor, count: int, scans: float) -> torch.Tensor:
+def goal_points(points: Tensor, count: int, scans: float) -> Tensor:
     """Clouds of goals [m] [B, count, 3], the first points of whole shapes [m] [B, P, 3], in no order.
 
     A share ``scans`` is as :func:`vd.evaluate.scanned.scan` has them: a side is missing, others
     stand for it, and points are noisy.
     """
-    goal, device = points[:, :count], points.device
+    goal = points[:, :count]
+    device = points.device
     scan = torch.rand((len(goal), 1), device=device) < scans
-    height = (goal @ torch.randn((len(goal), 3, 1), device=device)).squeeze(-1)
-    there = height <= height.kthvalue(round((1.0 - MISSING) * count), dim=1, keepdim=True).values
+    direction = torch.randn((len(goal), 3, 1), device=device)
+    height = (goal @ direction).squeeze(-1)
+    kept = round((1.0 - MISSING) * count)
+    there = height <= height.kthvalue(kept, dim=1, keepdim=True).values
     index = torch.arange(count, device=device).expand(len(goal), -1)
     index = torch.where(scan & ~there, drawn(there.float(), count), index)
-    return goal.take_along_dim(index[..., None], dim=1) + NOISE_M * scan[
-        ..., None
-    ] * torch.randn_like(goal)
+    goal = goal.take_along_dim(index[..., None], dim=1)
+    return goal + NOISE_M * scan[..., None] * torch.randn_like(goal)
+
+
+def posed(shapes: Tensor, rotation: Tensor, position: Tensor) -> Tensor:
+    """Points and normals [.., P, 6] turned by matrices [.., 3, 3] and shifted by [.., 3]."""
+    points = carried(shapes[..., :3], rotation, position[..., None, :])
+    normals = carried(shapes[..., 3:], rotation)
+    return torch.cat([points, normals], dim=-1)
 
 
 def draw_pairs(
-    hands: Hands, shapes: torch.Tensor, count: int, *, near: float = 0.0, scans: float = 0.0
+    hands: Hands, shapes: Tensor, count: int, *, near: float = 0.0, scans: float = 0.0
 ) -> Pairs:
     """Pairs of a goal and of what is seen of the same shape, of different points of it.
 
@@ -278,24 +274,22 @@ def draw_pairs(
         near: Share of pairs that are less than ``NEAR_RAD`` apart; others are uniform on SO(3).
         scans: Share of goals as from scans.
     """
-    batch, device = len(shapes), shapes.device
-    shapes = shapes[:, torch.randperm(shapes.shape[1], device=device)].float()
+    batch = len(shapes)
+    device = shapes.device
+    order = torch.randperm(shapes.shape[1], device=device)
+    shapes = shapes[:, order].float()
     orientation = random_matrices(batch, device)
-    held = orientation.transpose(-1, -2)
-    place = hands.box[0] + (hands.box[1] - hands.box[0]) * uniform(
-        0.0, 1.0, batch, 3, device=device
-    )
-    rest = shapes[:, count:]
-    posed = torch.cat([rest[..., :3] @ held + place[:, None], rest[..., 3:] @ held], dim=-1)
-    seen = camera_points(hands, hands.holding(posed[..., :3]), posed, count)
+    place = uniform(*hands.box, batch, 3, device=device)
+    held = posed(shapes[:, count:], orientation, place)
+    seen = camera_points(hands, hands.holding(held[..., :3]), held, count)
     return with_goals(shapes[..., :3], orientation, place, seen, near=near, scans=scans)
 
 
 def with_goals(
-    shapes: torch.Tensor,
-    orientation: torch.Tensor,
-    place: torch.Tensor,
-    seen: torch.Tensor,
+    shapes: Tensor,
+    orientation: Tensor,
+    place: Tensor,
+    seen: Tensor,
     *,
     near: float,
     scans: float,
@@ -310,25 +304,26 @@ def with_goals(
         near: Share of pairs that are less than ``NEAR_RAD`` apart; others are uniform on SO(3).
         scans: Share of goals as from scans.
     """
-    batch, device = len(shapes), shapes.device
+    batch = len(shapes)
+    device = shapes.device
     angle = NEAR_RAD * torch.rand(batch, device=device)
-    small = matrices(two_columns(rotations_about(torch.randn((batch, 3), device=device), angle)))
+    small = matrices_about(torch.randn((batch, 3), device=device), angle)
     is_near = torch.rand((batch, 1, 1), device=device) < near
     turn = torch.where(is_near, small, random_matrices(batch, device))
-    wanted = orientation.transpose(-1, -2) @ turn  # its transpose turns the shape to the goal
+    wanted = orientation.mT @ turn  # its transpose turns the shape to the goal
     goal = goal_points(shapes, seen.shape[1], scans)
-    middle, mean = goal.mean(dim=1, keepdim=True), seen.mean(dim=1)
+    middle = goal.mean(dim=1, keepdim=True)
+    mean = seen.mean(dim=1)
     return Pairs(
-        (goal - middle) @ wanted,
-        seen - mean[:, None],
-        turn,
-        (middle @ orientation.transpose(-1, -2))[:, 0] + place - mean,
-        (shapes - middle) @ wanted,
+        goal=(goal - middle) @ wanted,
+        seen=seen - mean[:, None],
+        rotation=turn,
+        offset=carried(middle, orientation)[:, 0] + place - mean,
+        surface=(shapes - middle) @ wanted,
     )
 
 
 def joined(first: Pairs, second: Pairs) -> Pairs:
     """Pairs of both, one after the other."""
-    return Pairs(
-        *(torch.cat([getattr(pairs, f.name) for pairs in (first, second)]) for f in fields(Pairs))
-    )
+    both = zip(vars(first).values(), vars(second).values(), strict=True)
+    return Pairs(*map(torch.cat, both))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from vd.assets_usd.hand_data import HandModel
 from vd.geometry.quaternions import product, rotated
@@ -46,7 +47,7 @@ class ActingStudent:
         hidden: Memory for the next step [N, G].
     """
 
-    def __init__(self, network: Student, hand: HandModel, goals: torch.Tensor):
+    def __init__(self, network: Student, hand: HandModel, goals: Tensor):
         self.network = network
         self.build = InputBuilder(hand, goals)
         upright = goals.new_tensor([0.0, 0.0, 0.0, 1.0])
@@ -56,19 +57,20 @@ class ActingStudent:
         self._base = mount.repeat(len(goals), 1)
 
     @property
-    def pose(self) -> torch.Tensor:
+    def pose(self) -> Tensor:
         """Where the objects' frames are believed to be, base frame [N, 7]."""
         return self.build.pose_of(self.belief)
 
     def look(self, senses: Senses) -> StudentInput:
         """What the network reads; where an episode begins nothing is known from before."""
-        fresh = senses.fresh
+        fresh = senses.fresh[:, None]
         first = self.build.first_belief(senses.goal_quat)
+        before = self.belief
         self.belief = Belief(
-            rotation=torch.where(fresh[:, None, None], first.rotation, self.belief.rotation),
-            position=torch.where(fresh[:, None], first.position, self.belief.position),
+            rotation=torch.where(fresh[..., None], first.rotation, before.rotation),
+            position=torch.where(fresh, first.position, before.position),
         )
-        self.hidden = self.hidden.masked_fill(fresh[:, None], 0.0)
+        self.hidden = self.hidden.masked_fill(fresh, 0.0)
         return self.build(senses, self.belief)
 
     def decide(self, sight: StudentInput) -> StudentOutput:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional
 
 from vd.vision.cfg import AlignmentCfg
@@ -27,7 +27,7 @@ WAVES = (1.5, 3.0, 6.0, 12.0)
 """Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2
 cm.
 """
-PAIRS_AT_ONCE = 4096
+AT_ONCE = 4096
 """Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
 PASSES = 2
 """Passes by which each start of a first look is improved. Of 208 made looks at validation meshes,
@@ -44,9 +44,9 @@ GOAL, SEEN = 0, 1
 class Residual:
     """What is predicted of pairs of clouds."""
 
-    rotation: torch.Tensor
+    rotation: Tensor
     """By how much the goal is still to be turned, matrices [B, 3, 3]."""
-    offset: torch.Tensor
+    offset: Tensor
     """Where the goal's mean lies on the object, from the mean of what is seen [m] [B, 3]."""
 
 
@@ -55,28 +55,39 @@ class Patches(nn.Module):
 
     def __init__(self, cfg: AlignmentCfg):
         super().__init__()
-        self.cfg, inner = cfg, 2 * cfg.patch
-        self.points = nn.Sequential(nn.Linear(3, cfg.patch), nn.ReLU(), nn.Linear(cfg.patch, inner))
+        self.cfg = cfg
+        inner = 2 * cfg.patch
+        self.points = nn.Sequential(
+            nn.Linear(3, cfg.patch),
+            nn.ReLU(),
+            nn.Linear(cfg.patch, inner),
+        )
         self.patch = nn.Linear(inner, cfg.width)
-        self.place = nn.Linear(3 * (1 + 2 * len(WAVES)), cfg.width)
+        known = 3 * (1 + 2 * len(WAVES))
+        self.place = nn.Linear(known, cfg.width)
 
-    @torch.no_grad()
-    def neighbours(self, cloud: torch.Tensor) -> torch.Tensor:
-        """Points of each patch of clouds [B, P, 3], indices [B, T, K].
-
-        They stay when a cloud is turned.
-        """
-        apart = torch.cdist(cloud[:, : self.cfg.tokens], cloud)
-        return apart.topk(self.cfg.neighbours, largest=False, sorted=False).indices
-
-    def forward(self, cloud: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
+    def forward(self, cloud: Tensor, near: Tensor) -> Tensor:
         """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], in no order, and their neighbours."""
         centres = cloud[:, : self.cfg.tokens]
         rows = torch.arange(cloud.shape[0], device=cloud.device)[:, None, None]
-        read = self.points((cloud[rows, near] - centres[:, :, None]) / PATCH_M)
+        offsets = cloud[rows, near] - centres[:, :, None]
+        read = self.points(offsets / PATCH_M).amax(dim=2)
         place = centres / CLOUD_M
-        waves = [wave(place * scale) for scale in WAVES for wave in (torch.sin, torch.cos)]
-        return self.patch(read.amax(dim=2)) + self.place(torch.cat([place, *waves], dim=-1))
+        known = [place]
+        for scale in WAVES:
+            known.append(torch.sin(place * scale))
+            known.append(torch.cos(place * scale))
+        places = self.place(torch.cat(known, dim=-1))
+        return self.patch(read) + places
+
+
+def perceptron(width: int, outputs: int) -> nn.Sequential:
+    """A hidden layer twice as wide as what comes in, and the layer that reads it."""
+    return nn.Sequential(
+        nn.Linear(width, 2 * width),
+        nn.GELU(),
+        nn.Linear(2 * width, outputs),
+    )
 
 
 class Layer(nn.Module):
@@ -86,17 +97,18 @@ class Layer(nn.Module):
         super().__init__()
         self.heads = heads
         self.norms = nn.ModuleList([nn.LayerNorm(width), nn.LayerNorm(width)])
-        self.mix, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.inner = nn.Sequential(
-            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
-        )
+        self.mix = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.inner = perceptron(width, width)
 
-    def forward(self, tokens: torch.Tensor, first: int | None = None) -> torch.Tensor:
+    def forward(self, tokens: Tensor, first: int | None = None) -> Tensor:
         """Tokens [B, T, E] that have read each other; the ``first`` ones alone, or all."""
-        mixed = self.mix(self.norms[0](tokens)).unflatten(-1, (3, self.heads, -1))
+        mixed = self.mix(self.norms[0](tokens))
+        mixed = mixed.unflatten(-1, (3, self.heads, -1))
         query, key, value = mixed.permute(2, 0, 3, 1, 4)
         read = functional.scaled_dot_product_attention(query[:, :, :first], key, value)
-        tokens = tokens[:, :first] + self.out(read.transpose(1, 2).flatten(2))
+        read = read.transpose(1, 2).flatten(2)
+        tokens = tokens[:, :first] + self.out(read)
         return tokens + self.inner(self.norms[1](tokens))
 
 
@@ -115,51 +127,58 @@ class AlignmentNetwork(nn.Module):
         self.summary = nn.Parameter(0.02 * torch.randn(1, 1, cfg.width))
         self.layers = nn.ModuleList(Layer(cfg.width, cfg.heads) for _ in range(cfg.layers))
         self.norm = nn.LayerNorm(cfg.width)
-        self.heads = nn.ModuleDict(
-            {
-                name: nn.Sequential(
-                    nn.Linear(cfg.width, 2 * cfg.width), nn.GELU(), nn.Linear(2 * cfg.width, n)
-                )
-                for name, n in {"rotation": 6, "offset": 3}.items()
-            }
-        )
+        self.heads = nn.ModuleDict()
+        self.heads["rotation"] = perceptron(cfg.width, 6)
+        self.heads["offset"] = perceptron(cfg.width, 3)
 
-    def neighbours(self, cloud: torch.Tensor) -> torch.Tensor:
-        """Points of each patch of clouds [B, P, 3], indices [B, T, K]."""
-        return self.patches.neighbours(cloud)
+    @torch.no_grad()
+    def neighbours(self, cloud: Tensor) -> Tensor:
+        """Points of each patch of clouds [B, P, 3], indices [B, T, K].
 
-    def encode(self, cloud: torch.Tensor, kind: int, near: torch.Tensor) -> torch.Tensor:
+        They stay when a cloud is turned.
+        """
+        apart = torch.cdist(cloud[:, : self.cfg.tokens], cloud)
+        return apart.topk(self.cfg.neighbours, largest=False, sorted=False).indices
+
+    def encode(self, cloud: Tensor, kind: int, near: Tensor) -> Tensor:
         """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], of goals or of what is seen."""
         return self.patches(cloud, near) + self.kinds[kind]
 
-    def compare(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
+    def compare(self, goal: Tensor, seen: Tensor) -> Residual:
         """What is predicted from the tokens of goals and of what is seen, [B, T, E] each."""
-        tokens = torch.cat([self.summary.expand(goal.shape[0], -1, -1), goal, seen], dim=1)
+        summary = self.summary.expand(goal.shape[0], -1, -1)
+        tokens = torch.cat([summary, goal, seen], dim=1)
         *before, last = self.layers
         for layer in before:
             tokens = layer(tokens)
         summary = self.norm(last(tokens, first=1)[:, 0])
-        found = {name: head(summary).float() for name, head in self.heads.items()}
-        return Residual(matrices(found["rotation"]), CLOUD_M * found["offset"])
+        columns = self.heads["rotation"](summary).float()
+        offset = self.heads["offset"](summary).float()
+        return Residual(matrices(columns), CLOUD_M * offset)
 
     def forward(
-        self, goal: torch.Tensor, seen: torch.Tensor, near: Sequence[torch.Tensor] | None = None
+        self,
+        goal: Tensor,
+        seen: Tensor,
+        near: Sequence[Tensor] | None = None,
     ) -> Residual:
         """What is predicted of clouds about their means [m] [B, P, 3].
 
         Their :meth:`neighbours` if known.
         """
-        near = near or [self.neighbours(cloud) for cloud in (goal, seen)]
-        return self.compare(self.encode(goal, GOAL, near[0]), self.encode(seen, SEEN, near[1]))
+        of_goal, of_seen = near or [self.neighbours(goal), self.neighbours(seen)]
+        goal_tokens = self.encode(goal, GOAL, of_goal)
+        seen_tokens = self.encode(seen, SEEN, of_seen)
+        return self.compare(goal_tokens, seen_tokens)
 
 
 @dataclass(frozen=True)
 class Alignment:
     """Where the goal's cloud lies on the object."""
 
-    rotation: torch.Tensor
+    rotation: Tensor
     """From the goal to the object, matrices [N, 3, 3]."""
-    position: torch.Tensor
+    position: Tensor
     """Where the goal's mean lies on the object, in the frame of what is seen [m] [N, 3]."""
 
 
@@ -175,19 +194,22 @@ class Aligner:
         goal: Goals' clouds [m] [N, P, 3].
     """
 
-    def __init__(self, network: AlignmentNetwork, goal: torch.Tensor):
-        self.network, self._starts = network, cube_rotations(goal.device)
+    def __init__(self, network: AlignmentNetwork, goal: Tensor):
+        self.network = network
+        self._starts = cube_rotations(goal.device)
         self._goal = goal - goal.mean(dim=1, keepdim=True)
-        self._near, self._normals = network.neighbours(self._goal), normals(self._goal)
-        self._found = torch.eye(3, device=goal.device).repeat(len(goal), 1, 1)
+        self._near = network.neighbours(self._goal)
+        self._normals = normals(self._goal)
+        unturned = torch.eye(3, device=goal.device)
+        self._rotation = unturned.repeat(len(goal), 1, 1)
         self._known = torch.zeros(len(goal), dtype=torch.bool, device=goal.device)
 
-    def reset(self, rows: torch.Tensor) -> None:
+    def reset(self, rows: Tensor) -> None:
         """Forget what is known of objects, a mask or indices."""
         self._known[rows] = False
 
     @torch.inference_mode()
-    def look(self, seen: torch.Tensor, rows: torch.Tensor | None = None) -> Alignment:
+    def look(self, seen: Tensor, rows: Tensor | None = None) -> Alignment:
         """Compare once.
 
         Args:
@@ -197,57 +219,86 @@ class Aligner:
         Returns:
             Tensors of inference mode: clone them before changing them or learning from them.
         """
-        rows = torch.arange(len(self._goal), device=seen.device) if rows is None else rows
+        if rows is None:
+            rows = torch.arange(len(self._goal), device=seen.device)
         mean = seen.mean(dim=1)
         seen = seen - mean[:, None]
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
         new = ~self._known[rows]
         if bool(new.any()):
-            self._found[rows[new]] = self._first(rows[new], tokens[new], seen[new])
-            self._known[rows] = True
-        found, offset, _ = self._laid(
-            rows, seen, *self._improve(rows, tokens, self._found[rows, None])
-        )
-        self._found[rows] = found[:, 0]
-        return Alignment(found[:, 0], mean + offset[:, 0])
+            unknown = rows[new]
+            self._rotation[unknown] = self._first(unknown, tokens[new], seen[new])
+            self._known[unknown] = True
+        look = torch.arange(len(rows), device=rows.device)
+        rotation, offset = self._improved(rows, look, tokens, self._rotation[rows])
+        rotation, offset, _ = self._laid(rows, look, seen, rotation, offset)
+        self._rotation[rows] = rotation
+        return Alignment(rotation, mean + offset)
 
-    def _first(self, rows: torch.Tensor, tokens: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+    def _first(self, rows: Tensor, tokens: Tensor, seen: Tensor) -> Tensor:
         """The best that starts come to, rotations [R, 3, 3]."""
-        found = self._starts.expand(len(rows), -1, -1, -1)
+        looks = torch.arange(len(rows), device=rows.device)
+        starts = len(self._starts)
+        look = looks.repeat_interleave(starts)
+        rotation = self._starts.repeat(len(rows), 1, 1)
         for _ in range(PASSES):
-            found, offset = self._improve(rows, tokens, found)
-        found, _, misfit = self._laid(rows, seen, found, offset)
-        return found[torch.arange(len(rows), device=rows.device), misfit.argmin(dim=1)]
+            rotation, offset = self._improved(rows, look, tokens, rotation)
+        rotation, _, misfit = self._laid(rows, look, seen, rotation, offset)
+        best = misfit.unflatten(0, (-1, starts)).argmin(dim=1)
+        return rotation[starts * looks + best]
+
+    def _improved(
+        self,
+        rows: Tensor,
+        look: Tensor,
+        tokens: Tensor,
+        rotation: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """One pass over hypotheses.
+
+        Args:
+            rows: Object of each look [R].
+            look: Look of each hypothesis [H].
+            tokens: Of what is seen in each look [R, T, E].
+            rotation: The hypotheses [H, 3, 3].
+
+        Returns:
+            Better ones [H, 3, 3], and their offsets [H, 3].
+        """
+        residuals = []
+        offsets = []
+        for some, turn in zip(look.split(AT_ONCE), rotation.split(AT_ONCE), strict=True):
+            goal = rows[some]
+            turned = self._goal[goal] @ turn.mT
+            goal_tokens = self.network.encode(turned, GOAL, self._near[goal])
+            residual = self.network.compare(goal_tokens, tokens[some])
+            residuals.append(residual.rotation)
+            offsets.append(residual.offset)
+        better = torch.cat(residuals) @ rotation
+        better = matrices(first_columns(better))  # still rotations after many
+        return better, torch.cat(offsets)
 
     def _laid(
-        self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor, offsets: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Hypotheses [R, H, 3, 3] and offsets [R, H, 3] laid onto what is seen, and their misfits [m]."""
-        shape, pair = rotations.shape[:2], torch.arange(len(rows), device=rows.device)
-        pair, parts = pair.repeat_interleave(shape[1]), []
-        for some in torch.arange(len(pair), device=rows.device).split(PAIRS_AT_ONCE):
-            goal = rows[pair[some]]
-            clouds = self._goal[goal], self._normals[goal], seen[pair[some]]
-            parts.append(
-                refine(*clouds, rotations.flatten(0, 1)[some], offsets.flatten(0, 1)[some], STEPS)
-            )
-        found, offset, misfit = (torch.cat(v).unflatten(0, shape) for v in zip(*parts, strict=True))
-        return found, offset, misfit
-
-    def _improve(
-        self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """One pass over hypotheses [R, H, 3, 3]: better ones, and their offsets [R, H, 3]."""
-        shape, flat = rotations.shape[:2], rotations.flatten(0, 1)
-        pair = torch.arange(len(rows), device=rows.device).repeat_interleave(shape[1])
+        self,
+        rows: Tensor,
+        look: Tensor,
+        seen: Tensor,
+        rotation: Tensor,
+        offset: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Hypotheses laid onto what is seen [R, S, 3], and their misfits [m] [H]; else as above."""
         parts = []
-        for some in torch.arange(len(pair), device=rows.device).split(PAIRS_AT_ONCE):
-            goal = rows[pair[some]]
-            turned = self._goal[goal] @ flat[some].transpose(-1, -2)
-            tokens = self.network.encode(turned, GOAL, self._near[goal])
-            parts.append(self.network.compare(tokens, seen[pair[some]]))
-        better = torch.cat([part.rotation for part in parts]) @ flat
-        better = matrices(first_columns(better))  # still rotations after many
-        return better.unflatten(0, shape), torch.cat([part.offset for part in parts]).unflatten(
-            0, shape
-        )
+        for some in torch.arange(len(look), device=look.device).split(AT_ONCE):
+            pair = look[some]
+            goal = rows[pair]
+            laid = refine(
+                self._goal[goal],
+                self._normals[goal],
+                seen[pair],
+                rotation[some],
+                offset[some],
+                STEPS,
+            )
+            parts.append(laid)
+        rotation, offset, misfit = map(torch.cat, zip(*parts, strict=True))
+        return rotation, offset, misfit

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.vision.alignment import Aligner, AlignmentNetwork
@@ -55,11 +56,14 @@ class GoalFinder:
         world_object: np.ndarray,
         world_scale: np.ndarray,
     ):
-        device, envs = network.summary.device, len(world_object)
-        clouds = np.stack([item.surface_points for item in objects])[world_object]
-        scaled = clouds * np.asarray(world_scale)[:, None, None]
-        cloud = torch.tensor(scaled, dtype=torch.float32, device=device)
-        self._mean, self._aligner = cloud.mean(dim=1), Aligner(network, cloud)
+        device = network.summary.device
+        envs = len(world_object)
+        surfaces = np.stack([item.surface_points for item in objects])
+        scale = np.asarray(world_scale)[:, None, None]
+        scaled = scale * surfaces[world_object]
+        goals = torch.tensor(scaled, dtype=torch.float32, device=device)
+        self._mean = goals.mean(dim=1)
+        self._aligner = Aligner(network, goals)
         self.share = (GOLDEN * torch.arange(SEEN_POINTS, device=device)) % 1.0
         self.pose = torch.zeros((envs, 1, 7), device=device)
         self.pose[..., 6] = 1.0
@@ -67,7 +71,7 @@ class GoalFinder:
         self.seen = torch.zeros((envs, SEEN_POINTS, 3), device=device)
         self.seen_now = torch.zeros(envs, dtype=torch.bool, device=device)
 
-    def look(self, seen: torch.Tensor, count: torch.Tensor, *, fresh: torch.Tensor) -> None:
+    def look(self, seen: Tensor, count: Tensor, *, fresh: Tensor) -> None:
         """Look once in every environment.
 
         Where too little is seen of the object all stays as it is.
@@ -79,27 +83,26 @@ class GoalFinder:
         """
         self.looks.masked_fill_(fresh, 0)
         self._aligner.reset(fresh)
-        count, crowded = self._crowded(seen, count)
+        crowded = _crowded(seen, count)
+        count = crowded.sum(dim=1)
         self.seen_now = count >= LEAST
         rows = self.seen_now.nonzero().flatten()  # waits for the device
         if not len(rows):
             return
-        chosen = torch.searchsorted(
-            crowded[rows].cumsum(dim=1), (self.share * count[rows, None]).long() + 1
-        )
-        self.seen[rows] = points = seen[rows].take_along_dim(chosen[..., None], dim=1)
-        found = self._aligner.look(points, rows)
-        place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
-        self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)
+        wanted = (self.share * count[rows, None]).long() + 1
+        chosen = torch.searchsorted(crowded[rows].cumsum(dim=1), wanted)
+        points = seen[rows].take_along_dim(chosen[..., None], dim=1)
+        self.seen[rows] = points
+        alignment = self._aligner.look(points, rows)
+        middle = alignment.rotation @ self._mean[rows, :, None]
+        place = alignment.position - middle.squeeze(-1)
+        orientation = quaternions(alignment.rotation)
+        self.pose[rows, 0] = torch.cat([place, orientation], dim=1)
         self.looks[rows] += 1
 
-    def _crowded(
-        self, seen: torch.Tensor, count: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Which points have others beside them [N, M], and how many [N].
 
-        Edges of depth fly about alone.
-        """
-        crowded = (torch.cdist(seen, seen) < CROWD_M).sum(dim=-1) > CROWD
-        crowded &= torch.arange(seen.shape[1], device=seen.device) < count[:, None]
-        return crowded.sum(dim=1), crowded.long()
+def _crowded(seen: Tensor, count: Tensor) -> Tensor:
+    """Which of the first ``count`` points have others beside them: edges of depth fly about alone."""
+    neighbours = (torch.cdist(seen, seen) < CROWD_M).sum(dim=-1)
+    index = torch.arange(seen.shape[1], device=seen.device)
+    return (neighbours > CROWD) & (index < count[:, None])

@@ -6,8 +6,9 @@ B pairs of clouds, P points of a goal, S of what is seen. Metres.
 """
 
 import torch
+from torch import Tensor
 
-from vd.vision.rotations import matrices, rotations_about, two_columns
+from vd.vision.rotations import matrices_about
 
 NEIGHBOURS = 12
 """Points of which a goal's normals are taken: of 500 they reach about 1.5 cm.
@@ -24,16 +25,17 @@ STEP_RAD = 0.2
 """Largest turn of a step."""
 
 
-def normals(cloud: torch.Tensor) -> torch.Tensor:
+def normals(cloud: Tensor) -> Tensor:
     """Normals [B, P, 3] of clouds [B, P, 3], of either sign."""
     near = torch.cdist(cloud, cloud).topk(NEIGHBOURS, largest=False).indices
-    points = cloud[torch.arange(len(cloud), device=cloud.device)[:, None, None], near]
+    rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
+    points = cloud[rows, near]
     points = points - points.mean(dim=2, keepdim=True)
-    spread = (points.transpose(-1, -2) @ points).cpu()  # so many small ones take a GPU longer
+    spread = (points.mT @ points).cpu()  # so many small ones take a GPU longer
     return torch.linalg.eigh(spread).eigenvectors[..., 0].to(cloud.device)
 
 
-def nearest(apart: torch.Tensor) -> torch.Tensor:
+def nearest(apart: Tensor) -> Tensor:
     """Indices [..] of the least of squared distances [.., P].
 
     On a CPU NumPy takes an eighth of the time.
@@ -44,13 +46,13 @@ def nearest(apart: torch.Tensor) -> torch.Tensor:
 
 
 def refine(
-    goal: torch.Tensor,
-    normal: torch.Tensor,
-    seen: torch.Tensor,
-    rotation: torch.Tensor,
-    offset: torch.Tensor,
+    goal: Tensor,
+    normal: Tensor,
+    seen: Tensor,
+    rotation: Tensor,
+    offset: Tensor,
     steps: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Turn and shift goals until what is seen lies on their planes.
 
     Args:
@@ -64,26 +66,41 @@ def refine(
     Returns:
         Rotations, offsets, and root mean square distances from the planes [m] [B].
     """
-    square, planes = goal.square().sum(dim=-1), torch.cat([goal, normal], dim=-1)
-    damping = DAMPING * seen.shape[1] * torch.eye(6, device=seen.device)
     moved = (seen - offset[:, None]) @ rotation  # in the goals' frames, which stay
-    for left in range(steps, -1, -1):
-        # Squared distances but for those of the moved points from the origins.
-        apart = torch.baddbmm(square[:, None], moved, goal.transpose(-1, -2), alpha=-2.0)
-        index = nearest(apart)[..., None]
-        near, facing = planes.take_along_dim(index, dim=1).split(3, dim=-1)
+    count = seen.shape[1]
+    damping = DAMPING * count * torch.eye(6, device=seen.device)
+    for _ in range(steps):
+        near, facing, apart = _planes(goal, normal, moved)
         away = (facing * (near - moved)).sum(dim=-1)
-        if not left:
-            break
-        apart = apart.take_along_dim(index, dim=-1).squeeze(-1) + moved.square().sum(dim=-1)
-        inside = apart <= apart.kthvalue(int(NEAREST * seen.shape[1]), dim=1, keepdim=True).values
+        most = apart.kthvalue(int(NEAREST * count), dim=1, keepdim=True).values
+        inside = apart <= most
         middle = moved.mean(dim=1, keepdim=True)
-        slope = torch.cat([torch.linalg.cross((near - middle) / CLOUD_M, facing), facing], dim=-1)
-        pulled = (slope * inside[..., None]).transpose(-1, -2)
-        step = torch.linalg.solve(pulled @ slope + damping, (pulled @ away[..., None]).squeeze(-1))
+        arm = (near - middle) / CLOUD_M
+        lever = torch.linalg.cross(arm, facing)
+        slope = torch.cat([lever, facing], dim=-1)
+        pulled = (slope * inside[..., None]).mT
+        force = (pulled @ away[..., None]).squeeze(-1)
+        step = torch.linalg.solve(pulled @ slope + damping, force)
         turn = step[:, :3] / CLOUD_M
-        back = matrices(two_columns(rotations_about(-turn, turn.norm(dim=-1).clamp(max=STEP_RAD))))
-        moved = (moved - middle) @ back + middle + step[:, None, 3:]
+        angle = turn.norm(dim=-1).clamp(max=STEP_RAD)
+        back = matrices_about(-turn, angle)
+        shift = step[:, None, 3:]
+        moved = (moved - middle) @ back + middle + shift
         rotation = rotation @ back
-    offset = seen.mean(dim=1) - (rotation @ moved.mean(dim=1)[..., None]).squeeze(-1)
+    near, facing, _ = _planes(goal, normal, moved)
+    away = (facing * (near - moved)).sum(dim=-1)
+    middle = rotation @ moved.mean(dim=1)[..., None]
+    offset = seen.mean(dim=1) - middle.squeeze(-1)
     return rotation, offset, away.square().mean(dim=-1).sqrt()
+
+
+def _planes(goal: Tensor, normal: Tensor, moved: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Goals' points nearest to moved ones [B, S, 3], normals there, and squared distances [B, S]."""
+    square = goal.square().sum(dim=-1)[:, None]
+    # Squared distances but for those of the moved points from the origins.
+    apart = torch.baddbmm(square, moved, goal.mT, alpha=-2.0)
+    index = nearest(apart)[..., None]
+    near = goal.take_along_dim(index, dim=1)
+    facing = normal.take_along_dim(index, dim=1)
+    least = apart.take_along_dim(index, dim=-1).squeeze(-1)
+    return near, facing, least + moved.square().sum(dim=-1)

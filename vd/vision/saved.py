@@ -31,7 +31,8 @@ class AlignmentSpec:
 
 def alignment_export(state: dict[str, Any]) -> dict[str, Any]:
     """The part of a checkpoint that :func:`load_alignment` needs."""
-    weights = {name: value.detach().cpu() for name, value in state["alignment_state_dict"].items()}
+    learned = state["alignment_state_dict"]
+    weights = {name: value.detach().cpu() for name, value in learned.items()}
     kept = {key: state[key] for key in ("spec", "iter", "env_steps")}
     return {"format": ALIGNMENT_FORMAT, **kept, "alignment_state_dict": weights}
 

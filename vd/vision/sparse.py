@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 import warp as wp
-from torch import nn
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from vd.geometry.arrays import as_warp
@@ -41,7 +41,7 @@ class Sites:
         step: Voxels of a cell's side, a power of two.
     """
 
-    def __init__(self, keys: torch.Tensor, clouds: int, step: int = 1):
+    def __init__(self, keys: Tensor, clouds: int, step: int = 1):
         self.keys = keys
         self.clouds = clouds
         self.step = step
@@ -55,14 +55,14 @@ class Sites:
         return as_warp(self.keys)
 
     @cached_property
-    def coordinates(self) -> torch.Tensor:
+    def coordinates(self) -> Tensor:
         """Rows (cloud, x, y, z) in voxels: each cell begins there, int32 [M, 4]."""
         rows = self.keys.new_empty((len(self), 4), dtype=torch.int32)
         launch(coordinates_kernel, len(self), [self.warp_keys], [as_warp(rows)])
         return rows
 
     @cached_property
-    def lengths(self) -> torch.Tensor:
+    def lengths(self) -> Tensor:
         """Cells of each cloud, int64 [B]."""
         ends = torch.arange(self.clouds + 1, device=self.keys.device) << CLOUD_SHIFT
         return torch.searchsorted(self.keys, ends).diff()
@@ -70,21 +70,23 @@ class Sites:
     @cached_property
     def coarser(self) -> "Sites":
         """Cells of twice the side that hold any of these."""
-        fine_bits = (2 * self.step) ** 3 - 1
-        return Sites(torch.unique_consecutive(self.keys & ~fine_bits), self.clouds, 2 * self.step)
+        step = 2 * self.step
+        fine_bits = step**3 - 1
+        keys = torch.unique_consecutive(self.keys & ~fine_bits)
+        return Sites(keys, self.clouds, step)
 
     @cached_property
-    def neighbours(self) -> torch.Tensor:
+    def neighbours(self) -> Tensor:
         """Rows that a kernel of stride 1 reads for each cell, M for none, int32 [M, 27]."""
         return kernel_map(self, self, self.step)
 
     @cached_property
-    def strided(self) -> torch.Tensor:
+    def strided(self) -> Tensor:
         """Rows a kernel of stride 2 reads for each coarser cell, M for none, int32 [.., 27]."""
         return kernel_map(self.coarser, self, self.step)
 
     @cached_property
-    def strided_back(self) -> torch.Tensor:
+    def strided_back(self) -> Tensor:
         """Coarser cells that read each cell so, by the opposite offsets, int32 [M, 27]."""
         return kernel_map(self, self.coarser, self.step)
 
@@ -93,13 +95,13 @@ class Sites:
 class SparseTensor:
     """Features of the occupied cells of a batch of clouds."""
 
-    features: torch.Tensor
+    features: Tensor
     """A row of each cell [M, C]."""
     sites: Sites
     """The cells."""
 
 
-def kernel_map(outputs: Sites, inputs: Sites, step: int) -> torch.Tensor:
+def kernel_map(outputs: Sites, inputs: Sites, step: int) -> Tensor:
     """Rows of ``inputs`` under a 3x3x3 kernel about each of ``outputs``, int32 [M, 27].
 
     Offsets are ``step`` voxels apart; F, their number, is where there is no cell.
@@ -115,7 +117,7 @@ def kernel_map(outputs: Sites, inputs: Sites, step: int) -> torch.Tensor:
 
 
 @torch.no_grad()
-def voxelise(kinds: Sequence[torch.Tensor], voxel_m: float) -> SparseTensor:
+def voxelise(kinds: Sequence[Tensor], voxel_m: float) -> SparseTensor:
     """Voxels of clouds, with features that tell what points they hold.
 
     Args:
@@ -135,7 +137,8 @@ def voxelise(kinds: Sequence[torch.Tensor], voxel_m: float) -> SparseTensor:
     keys, order = keys.flatten().sort(stable=True)
     voxels, counts = torch.unique_consecutive(keys, return_counts=True)
     voxels = voxels[voxels < len(points) << CLOUD_SHIFT]
-    start = torch.cat([counts.new_zeros(1), counts[: len(voxels)].cumsum(0)])
+    ends = counts[: len(voxels)].cumsum(0)
+    start = torch.cat([counts.new_zeros(1), ends])
     number = torch.arange(len(kinds), dtype=torch.int32, device=device)
     widths = torch.tensor([cloud.shape[1] for cloud in kinds], device=device)
     column_kind = number.repeat_interleave(widths, output_size=points.shape[1])
@@ -145,51 +148,54 @@ def voxelise(kinds: Sequence[torch.Tensor], voxel_m: float) -> SparseTensor:
     return SparseTensor(features, Sites(voxels, len(points)))
 
 
-def gathered(features: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
+def gathered(features: Tensor, table: Tensor) -> Tensor:
     """Rows of ``features`` [F + 1, C] side by side as ``table`` [M, K] names them, [M, K C]."""
     width = table.shape[1] * features.shape[1]
     return features.index_select(0, table.flatten()).view(len(table), width)
 
 
-def padded(features: torch.Tensor) -> torch.Tensor:
+def padded(features: Tensor) -> Tensor:
     """Features [F, C] with a last row of zeros, which maps name for no cell."""
-    return torch.cat([features, features.new_zeros((1, features.shape[1]))])
+    zeros = features.new_zeros((1, features.shape[1]))
+    return torch.cat([features, zeros])
 
 
-def parts(table: torch.Tensor, channels: int) -> tuple[torch.Tensor, ...]:
+def parts(table: Tensor, channels: int) -> tuple[Tensor, ...]:
     """Runs of rows of ``table`` [M, K] whose gathered matrices keep to :data:`GATHERED`."""
-    return table.split(max(1, GATHERED[table.device.type] // (table.shape[1] * channels)))
+    width = table.shape[1] * channels
+    rows = GATHERED[table.device.type] // width
+    return table.split(max(1, rows))
 
 
-def gather_multiply(
-    features: torch.Tensor, table: torch.Tensor, weight: torch.Tensor
-) -> torch.Tensor:
+def gather_multiply(features: Tensor, table: Tensor, weight: Tensor) -> Tensor:
     """Sum over k of ``features[table[:, k]] @ weight[k]``.
 
     [F, C_in], [M, K] and [K, C_in, C_out] give [M, C_out].
     """
     rows = padded(features)
     flat = weight.flatten(0, 1)
-    return torch.cat([gathered(rows, part) @ flat for part in parts(table, features.shape[1])])
+    products = [gathered(rows, part) @ flat for part in parts(table, features.shape[1])]
+    return torch.cat(products)
 
 
-def weight_gradient(
-    features: torch.Tensor, table: torch.Tensor, grad: torch.Tensor
-) -> torch.Tensor:
+def weight_gradient(features: Tensor, table: Tensor, grad: Tensor) -> Tensor:
     """Gradient of the weights of :func:`gather_multiply` [K, C_in, C_out].
 
     It is of single precision at least. Gathers again: kept, the matrix would take 27 times the
     memory of the features.
     """
     rows = padded(features)
-    shape = table.shape[1] * features.shape[1], grad.shape[1]
+    kernel = table.shape[1]
+    channels = features.shape[1]
     precision = torch.promote_types(features.dtype, torch.float32)
+    shape = kernel * channels, grad.shape[1]
     total = torch.zeros(shape, dtype=precision, device=grad.device)
     first = 0
-    for part in parts(table, features.shape[1]):
-        total += gathered(rows, part).T @ grad[first : first + len(part)]
-        first += len(part)
-    return total.view(table.shape[1], features.shape[1], -1)
+    for part in parts(table, channels):
+        end = first + len(part)
+        total += gathered(rows, part).T @ grad[first:end]
+        first = end
+    return total.view(kernel, channels, -1)
 
 
 class _Convolution(torch.autograd.Function):
@@ -202,17 +208,17 @@ class _Convolution(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        features: torch.Tensor,
-        weight: torch.Tensor,
-        table: torch.Tensor,
-        back: torch.Tensor | None,
-    ) -> torch.Tensor:
+        features: Tensor,
+        weight: Tensor,
+        table: Tensor,
+        back: Tensor | None,
+    ) -> Tensor:
         ctx.save_for_backward(features, weight, table, back)
         return gather_multiply(features, table, weight.to(features.dtype))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         features, weight, table, back = ctx.saved_tensors
         of_features = None
         of_weight = None
@@ -225,11 +231,11 @@ class _Convolution(torch.autograd.Function):
 
 
 def convolve(
-    features: torch.Tensor,
-    weight: torch.Tensor,
-    table: torch.Tensor,
-    back: torch.Tensor | None = None,
-) -> torch.Tensor:
+    features: Tensor,
+    weight: Tensor,
+    table: Tensor,
+    back: Tensor | None = None,
+) -> Tensor:
     """A convolution by a map and, where features learn, its reverse; in autocast's precision."""
     if torch.is_autocast_enabled(features.device.type):
         features = features.to(torch.get_autocast_dtype(features.device.type))
@@ -238,14 +244,8 @@ def convolve(
     return gather_multiply(features, table, weight.to(features.dtype))
 
 
-def kernel_weight(inputs: int, outputs: int) -> nn.Parameter:
-    """Weights of a 3x3x3 kernel [27, C_in, C_out], drawn as He et al. do for outputs."""
-    weight = torch.randn(KERNEL, inputs, outputs)
-    return nn.Parameter(math.sqrt(2.0 / (KERNEL * outputs)) * weight)
-
-
-class SubmanifoldConv(nn.Module):
-    """A 3x3x3 convolution without bias whose outputs are at the cells of its input.
+class KernelConv(nn.Module):
+    """Weights of a 3x3x3 convolution without bias [27, C_in, C_out], drawn as He et al. do for outputs.
 
     Args:
         inputs: C_in.
@@ -254,25 +254,22 @@ class SubmanifoldConv(nn.Module):
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
-        self.weight = kernel_weight(inputs, outputs)
+        weight = torch.randn(KERNEL, inputs, outputs)
+        self.weight = nn.Parameter(math.sqrt(2.0 / (KERNEL * outputs)) * weight)
+
+
+class SubmanifoldConv(KernelConv):
+    """A convolution whose outputs are at the cells of its input."""
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Output = sum of input(cell + offset) times the weights of the offset."""
         table = x.sites.neighbours
-        return SparseTensor(convolve(x.features, self.weight, table, table), x.sites)
+        features = convolve(x.features, self.weight, table, table)
+        return SparseTensor(features, x.sites)
 
 
-class StridedConv(nn.Module):
-    """A 3x3x3 convolution of stride 2 without bias; its outputs are at the coarser cells.
-
-    Args:
-        inputs: C_in.
-        outputs: C_out.
-    """
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.weight = kernel_weight(inputs, outputs)
+class StridedConv(KernelConv):
+    """A convolution of stride 2; its outputs are at the coarser cells."""
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Output = sum of input(2 cell + offset) times the weights of the offset."""
@@ -299,17 +296,21 @@ class ResidualBlock(nn.Module):
         """Features of the same cells."""
         inner = x
         for norm, conv in zip(self.norms, self.convs, strict=True):
-            inner = conv(SparseTensor(torch.relu(norm(inner.features)), x.sites))
+            features = torch.relu(norm(inner.features))
+            inner = conv(SparseTensor(features, x.sites))
         return SparseTensor(x.features + inner.features, x.sites)
 
 
-def global_pool(x: SparseTensor) -> torch.Tensor:
+def global_pool(x: SparseTensor) -> Tensor:
     """Largest and mean of each cloud's features [B, 2 C]; zeros of a cloud without cells.
 
     Of single precision at least.
     """
-    values = x.features.to(torch.promote_types(x.features.dtype, torch.float32))
+    precision = torch.promote_types(x.features.dtype, torch.float32)
+    values = x.features.to(precision)
     lengths = x.sites.lengths
     most = torch.segment_reduce(values, "max", lengths=lengths, unsafe=True)
     mean = torch.segment_reduce(values, "mean", lengths=lengths, unsafe=True)
-    return torch.where((lengths > 0)[:, None], torch.cat([most, mean], dim=1), 0.0)
+    occupied = (lengths > 0)[:, None]
+    pooled = torch.cat([most, mean], dim=1)
+    return torch.where(occupied, pooled, 0.0)

@@ -17,12 +17,13 @@ hand; metres, radians.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 import warp as wp
-from torch import nn
+from torch import Tensor, nn
 
 from vd.assets_usd.hand_data import HandModel
 from vd.geometry.arrays import as_warp
@@ -30,7 +31,7 @@ from vd.geometry.clouds import HandCloud
 from vd.paper import PAPER
 from vd.policy.senses import Senses
 from vd.vision.cfg import StudentCfg
-from vd.vision.rotations import first_columns, matrices, quaternions, two_columns
+from vd.vision.rotations import first_columns, matrices, quaternion_matrices, quaternions
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
 
 KINDS = 3
@@ -51,9 +52,9 @@ Step = TypeVar("Step", "StudentInput", "StudentOutput", "Belief", Senses)
 class Belief:
     """Where a goal's cloud is believed to lie on the object; leading axes [N] or [T, N]."""
 
-    rotation: torch.Tensor
+    rotation: Tensor
     """From the cloud's own axes to the base frame, matrices [.., 3, 3]."""
-    position: torch.Tensor
+    position: Tensor
     """Of the cloud's mean [m] [.., 3]."""
 
 
@@ -61,15 +62,15 @@ class Belief:
 class StudentInput:
     """What a student reads of a step; leading axes [N] or [T, N]."""
 
-    camera: torch.Tensor
+    camera: Tensor
     """What the camera sees, or complete surfaces; NaN for none [.., K, 3]."""
-    hand: torch.Tensor
+    hand: Tensor
     """The hand's own points by its joints [.., H, 3]."""
-    goal: torch.Tensor
+    goal: Tensor
     """The goal's cloud about its mean, in its own axes [.., P, 3]."""
-    goal_rotation: torch.Tensor
+    goal_rotation: Tensor
     """Wanted rotation, from the cloud's own axes to the base frame, matrices [.., 3, 3]."""
-    proprioception: torch.Tensor
+    proprioception: Tensor
     """Joint positions and velocities, scaled, and the last action [.., 3 D]."""
     belief: Belief
     """What the step before left."""
@@ -79,21 +80,21 @@ class StudentInput:
 class StudentOutput:
     """What a student says of a step; leading axes [N] or [T, N], the memory's [N]."""
 
-    mean: torch.Tensor
+    mean: Tensor
     """Mean of the action, not clipped [.., D]."""
-    log_std: torch.Tensor
+    log_std: Tensor
     """Logarithm of its standard deviation [.., D]."""
     belief: Belief
     """The better belief; detached it is the next step's."""
-    log_distance: torch.Tensor
+    log_distance: Tensor
     """Logarithm of the angle to the goal [rad] [..]."""
-    voxels: torch.Tensor
+    voxels: Tensor
     """How many voxels hold points of the camera and none of the hand [..]."""
-    hidden: torch.Tensor
+    hidden: Tensor
     """Memory after the last step [N, G]."""
 
 
-def each(step: Step, change: Callable[[torch.Tensor], torch.Tensor]) -> Step:
+def each(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
     """A step with every tensor changed, such as indexed."""
     values: dict[str, Any] = {}
     for field in fields(step):
@@ -103,11 +104,9 @@ def each(step: Step, change: Callable[[torch.Tensor], torch.Tensor]) -> Step:
     return type(step)(**values)
 
 
-def carried(
-    points: torch.Tensor, rotation: torch.Tensor, position: torch.Tensor | float = 0.0
-) -> torch.Tensor:
+def carried(points: Tensor, rotation: Tensor, position: Tensor | float = 0.0) -> Tensor:
     """Points [.., P, 3] turned by matrices [.., 3, 3] and shifted by [.., 1, 3]: P R^T + p."""
-    return points @ rotation.transpose(-1, -2) + position
+    return points @ rotation.mT + position
 
 
 class InputBuilder:
@@ -118,40 +117,42 @@ class InputBuilder:
         goals: Clouds of the goals, in their own axes and of true size [m] [N, P, 3].
     """
 
-    def __init__(self, hand: HandModel, goals: torch.Tensor):
+    def __init__(self, hand: HandModel, goals: Tensor):
         device = goals.device
         links = np.arange(len(hand.link_names))
         self.set_goals(goals)
         self._cloud = HandCloud(hand, link_body=links, device=str(device))
         self._links = len(links)
 
-        def constant(values: np.ndarray) -> torch.Tensor:
+        def constant(values: np.ndarray) -> Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
-        self._to_base = matrices(two_columns(constant(hand.mount[3:]))).T
+        self._to_base = quaternion_matrices(constant(hand.mount[3:])).T
         self._place = constant(hand.goal_in_base)
         self._lower = constant(hand.lower)
         self._range = constant(hand.upper - hand.lower)
 
-    def set_goals(self, goals: torch.Tensor) -> None:
+    def set_goals(self, goals: Tensor) -> None:
         """Take other clouds."""
-        self._middle = goals.mean(dim=1)
-        self._goals = goals - self._middle[:, None]
+        middle = goals.mean(dim=1)
+        self._middle = middle
+        self._goals = goals - middle[:, None]
 
-    def goal_rotation(self, goal_quat: torch.Tensor) -> torch.Tensor:
+    def goal_rotation(self, goal_quat: Tensor) -> Tensor:
         """Wanted rotations in the base frame [R, 3, 3], of quaternions in the world's [R, 4]."""
-        return self._to_base @ matrices(two_columns(goal_quat))
+        return self._to_base @ quaternion_matrices(goal_quat)
 
-    def goal_quat(self, rotation: torch.Tensor) -> torch.Tensor:
+    def goal_quat(self, rotation: Tensor) -> Tensor:
         """The inverse of :meth:`goal_rotation`."""
         return quaternions(self._to_base.T @ rotation)
 
-    def first_belief(self, goal_quat: torch.Tensor) -> Belief:
+    def first_belief(self, goal_quat: Tensor) -> Belief:
         """What is believed of an object before it is seen.
 
         It is turned as it is wanted and lies where objects are handled.
         """
-        return Belief(self.goal_rotation(goal_quat), self._place.repeat(len(goal_quat), 1))
+        rotation = self.goal_rotation(goal_quat)
+        return Belief(rotation, self._place.repeat(len(goal_quat), 1))
 
     def near_place(self, belief: Belief, reach_m: float) -> Belief:
         """A belief whose place is at most ``reach_m`` from where objects are handled."""
@@ -161,20 +162,20 @@ class InputBuilder:
         position = self._place + offset * share
         return Belief(belief.rotation, position)
 
-    def belief_of(self, pose: torch.Tensor, rows: torch.Tensor | None = None) -> Belief:
+    def belief_of(self, pose: Tensor, rows: Tensor | None = None) -> Belief:
         """What is to be believed of objects at poses in the base frame [R, 7]; ``rows`` as below."""
         middle = self._middle if rows is None else self._middle[rows]
-        rotation = matrices(two_columns(pose[:, 3:]))
-        return Belief(rotation, pose[:, :3] + carried(middle[:, None], rotation)[:, 0])
+        rotation = quaternion_matrices(pose[:, 3:])
+        position = carried(middle[:, None], rotation, pose[:, None, :3])
+        return Belief(rotation, position[:, 0])
 
-    def pose_of(self, belief: Belief) -> torch.Tensor:
+    def pose_of(self, belief: Belief) -> Tensor:
         """Where the frames of the objects of all environments are believed to be [N, 7]."""
         middle = carried(self._middle[:, None], belief.rotation)[:, 0]
-        return torch.cat([belief.position - middle, quaternions(belief.rotation)], dim=1)
+        orientation = quaternions(belief.rotation)
+        return torch.cat([belief.position - middle, orientation], dim=1)
 
-    def __call__(
-        self, senses: Senses, belief: Belief, rows: torch.Tensor | None = None
-    ) -> StudentInput:
+    def __call__(self, senses: Senses, belief: Belief, rows: Tensor | None = None) -> StudentInput:
         """What is read of R steps.
 
         Args:
@@ -217,7 +218,8 @@ class VoxelStage(nn.Module):
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Features of the coarser cells."""
         x = self.conv(x)
-        return self.blocks(SparseTensor(self.norm(x.features), x.sites))
+        normed = SparseTensor(self.norm(x.features), x.sites)
+        return self.blocks(normed)
 
 
 class Student(nn.Module):
@@ -242,13 +244,13 @@ class Student(nn.Module):
         self.num_actions = num_actions
         self.half = False
         widths = (4 * KINDS + 3, *cfg.channels)
-        self.stages = nn.Sequential(
-            *(
-                VoxelStage(inner, outer, cfg.blocks)
-                for inner, outer in zip(widths, cfg.channels, strict=False)
-            )
+        self.stages = nn.Sequential()
+        for inputs, outputs in pairwise(widths):
+            self.stages.append(VoxelStage(inputs, outputs, cfg.blocks))
+        self.project = nn.Sequential(
+            nn.Linear(2 * widths[-1], cfg.embedding),
+            nn.ReLU(),
         )
-        self.project = nn.Sequential(nn.Linear(2 * widths[-1], cfg.embedding), nn.ReLU())
         believed = len(UNTURNED) + 3
         self.senses = nn.Sequential(
             nn.Linear(3 * num_actions + believed, cfg.senses),
@@ -257,18 +259,21 @@ class Student(nn.Module):
         )
         self.memory = nn.GRU(cfg.embedding + cfg.senses, cfg.memory)
         self.residual = nn.Linear(cfg.memory, believed)
-        self.head = nn.Sequential(nn.Linear(cfg.memory + believed, cfg.head), nn.GELU())
+        self.head = nn.Sequential(
+            nn.Linear(cfg.memory + believed, cfg.head),
+            nn.GELU(),
+        )
         self.mean = nn.Linear(cfg.head, num_actions)
         self.log_std = nn.Linear(cfg.head, num_actions)
         nn.init.constant_(self.log_std.bias, UNSURE)
         self.log_distance = nn.Linear(cfg.head, 1)
         self.register_buffer("unturned", torch.tensor(UNTURNED), persistent=False)
 
-    def first_hidden(self, envs: int) -> torch.Tensor:
+    def first_hidden(self, envs: int) -> Tensor:
         """The memory where an episode begins: zeros [N, G]."""
         return self.mean.weight.new_zeros((envs, self.cfg.memory))
 
-    def encode(self, sight: StudentInput) -> tuple[torch.Tensor, torch.Tensor]:
+    def encode(self, sight: StudentInput) -> tuple[Tensor, Tensor]:
         """What one look shows [.., E], and voxels of the camera's points beside the hand's [..].
 
         Waits for the device.
@@ -277,22 +282,24 @@ class Student(nn.Module):
         place = sight.belief.position[..., None, :]
         laid = carried(sight.goal, sight.belief.rotation)
         kinds = [sight.camera - place, sight.hand - place, laid]
-        voxels = voxelise(
-            [self._within_reach(kind).flatten(0, -3) for kind in kinds], self.cfg.voxel_m
-        )
-        middles = self.cfg.voxel_m / PLACE_M * (voxels.sites.coordinates[:, 1:] + 0.5)
+        within = [self._within_reach(kind).flatten(0, -3) for kind in kinds]
+        voxels = voxelise(within, self.cfg.voxel_m)
+        cells = voxels.sites.coordinates[:, 1:]
+        middles = self.cfg.voxel_m / PLACE_M * (cells + 0.5)
         features = torch.cat([voxels.features, middles], dim=1)
         features = features.to(next(self.stages.parameters()).dtype)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
-            cells = self.stages(SparseTensor(features, voxels.sites))
-        pooled = global_pool(cells).to(place.dtype)
-        camera, hand = voxels.features[:, 0], voxels.features[:, 4]
+            coarse = self.stages(SparseTensor(features, voxels.sites))
+        pooled = global_pool(coarse).to(place.dtype)
+        camera = voxels.features[:, 0]
+        hand = voxels.features[:, 4]
         beside = camera * (1.0 - hand)
         count = torch.segment_reduce(beside, "sum", lengths=voxels.sites.lengths, unsafe=True)
-        return self.project(pooled).unflatten(0, lead), count.unflatten(0, lead)
+        look = self.project(pooled).unflatten(0, lead)
+        return look, count.unflatten(0, lead)
 
     def forward(
-        self, sight: StudentInput, hidden: torch.Tensor, done: torch.Tensor | None = None
+        self, sight: StudentInput, hidden: Tensor, done: Tensor | None = None
     ) -> StudentOutput:
         """Read a sequence.
 
@@ -302,9 +309,10 @@ class Student(nn.Module):
             done: Where step t was the last of an episode, bool [T, N]: t + 1 begins without memory.
         """
         belief = sight.belief
-        known = [sight.proprioception, self._believed(belief, sight.goal_rotation)]
+        believed = self._believed(belief, sight.goal_rotation)
+        sensed = self.senses(torch.cat([sight.proprioception, believed], dim=-1))
         look, voxels = self.encode(sight)
-        inputs = torch.cat([look, self.senses(torch.cat(known, dim=-1))], dim=-1)
+        inputs = torch.cat([look, sensed], dim=-1)
         remembered, hidden = self._remember(inputs, hidden, done)
         turn, shift = self.residual(remembered).split([len(UNTURNED), 3], dim=-1)
         turned = matrices(self.unturned + turn) @ belief.rotation
@@ -312,36 +320,41 @@ class Student(nn.Module):
             rotation=matrices(first_columns(turned)),  # still a rotation after many steps
             position=belief.position + PLACE_M * shift,
         )
-        known = [remembered, self._believed(better, sight.goal_rotation)]
-        features = self.head(torch.cat(known, dim=-1))
+        believed = self._believed(better, sight.goal_rotation)
+        features = self.head(torch.cat([remembered, believed], dim=-1))
         low, high = LOG_STD
+        mean = self.mean(features)
+        share = torch.sigmoid(self.log_std(features))
         return StudentOutput(
-            mean=self.mean(features),
-            log_std=low + (high - low) * torch.sigmoid(self.log_std(features)),
+            mean=mean,
+            log_std=low + (high - low) * share,
             belief=better,
             log_distance=self.log_distance(features).squeeze(-1),
             voxels=voxels,
             hidden=hidden,
         )
 
-    def act(self, sight: StudentInput, hidden: torch.Tensor) -> StudentOutput:
+    def act(self, sight: StudentInput, hidden: Tensor) -> StudentOutput:
         """One step of N hands: what :meth:`forward` says of it, leading axis [N]."""
-        output = self(each(sight, lambda value: value[None]), hidden)
-        return replace(each(output, lambda value: value[0]), hidden=output.hidden)
+        sequence = each(sight, lambda value: value[None])
+        output = self(sequence, hidden)
+        step = each(output, lambda value: value[0])
+        return replace(step, hidden=output.hidden)
 
-    def _within_reach(self, points: torch.Tensor) -> torch.Tensor:
+    def _within_reach(self, points: Tensor) -> Tensor:
         """Points [.., 3] about the object's place; NaN for those that are out of reach."""
         far = points.norm(dim=-1, keepdim=True) > self.cfg.reach_m
         return points.masked_fill(far, torch.nan)
 
-    def _believed(self, belief: Belief, goal_rotation: torch.Tensor) -> torch.Tensor:
+    def _believed(self, belief: Belief, goal_rotation: Tensor) -> Tensor:
         """From the goal to the object as two columns, and the object's place [.., 9]."""
-        turn = belief.rotation @ goal_rotation.transpose(-1, -2)
-        return torch.cat([first_columns(turn), belief.position / PLACE_M], dim=-1)
+        turn = belief.rotation @ goal_rotation.mT
+        place = belief.position / PLACE_M
+        return torch.cat([first_columns(turn), place], dim=-1)
 
     def _remember(
-        self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        self, inputs: Tensor, hidden: Tensor, done: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """The GRU over [T, N, ..], its memory cleared where episodes ended: [T, N, G], [N, G]."""
         outputs = []
         state = hidden[None]

@@ -1,0 +1,220 @@
+"""What ``vd-train student`` and ``vd-train alignment`` share: command line, task, and how a run begins."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from vd.command import interrupt
+from vd.command.device import resolve_device
+from vd.command.files import check_folder
+from vd.command.line import PRINT, ConfigFile, parse, say_same_as
+from vd.command.warp_quiet import quiet_warp
+from vd.envs.cfg import RandomisationCfg, ReorientCfg
+from vd.paper import PAPER
+from vd.policy.agents import check_names
+from vd.train.config import StageTaskCfg
+from vd.train.flags import (
+    installed_teacher,
+    machine_preset,
+    normalise,
+    saved_config,
+    starting,
+    value_of,
+    write_config,
+)
+from vd.train.teacher import BUILDING, is_main, run_folder, say_of_main
+
+if TYPE_CHECKING:
+    from vd.policy.actor import TrainedPolicy
+    from vd.train.alignment.config import AlignmentTrainCfg
+    from vd.train.student.config import StudentTrainCfg
+    from vd.train.supervised import SupervisedLoop
+
+Cfg = TypeVar("Cfg", "AlignmentTrainCfg", "StudentTrainCfg")
+Network = TypeVar("Network")
+Trainer = TypeVar("Trainer", bound="SupervisedLoop")
+
+SHORT_FORMS = {
+    "objects": "task.objects",
+    "num-envs": "task.num-envs",
+    "seed": "task.seed",
+    "validate": "task.validation",
+}
+"""Flags that are short for others."""
+
+
+@dataclass(frozen=True)
+class StagedTraining(Generic[Cfg]):
+    """A command of ``vd-train`` that trains in stages."""
+
+    name: str
+    """Its name."""
+    help: str
+    """What ``--help`` says first."""
+    presets: Mapping[str, Callable[[Any], Cfg]]
+    """Settings of a stage, by the name of the preset."""
+    smoke: Callable[[Any], Cfg]
+    """Settings of a stage's smoke test."""
+    begin_from: Callable[[Cfg, str | None], Cfg]
+    """Settings with what ``--init`` names, or with the stage before where it names nothing."""
+    build: Callable[[Cfg, Callable[[str], object]], "SupervisedLoop"]
+    """From settings to a trainer."""
+    result: str
+    """File in the run's folder that holds what was learned."""
+
+
+def parse_stage(training: StagedTraining[Cfg], flags: Sequence[str]) -> Cfg:
+    """The configuration that command-line flags ask for.
+
+    The first pass finds where to start from (``--preset`` and ``--stage``, the run's own
+    configuration with ``--resume``, the network to begin from), as flags and ``--config`` say; the
+    second reads every flag with those values, and over them those of the file, as defaults.
+
+    Raises:
+        FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
+        ValueError: What they name is not of this version, or nothing is installed to begin from.
+    """
+    arguments, file = starting(normalise(flags, SHORT_FORMS))
+    # Wrong flags and names, and --help, do not wait for torch.
+    words = [word for word in arguments if word != PRINT]
+    asked = _parsed(training, words, training.presets["gpu"](0), file)
+    preset = value_of(arguments, "--preset") or machine_preset(value_of(arguments, "--device"))
+    start = training.smoke if "--smoke" in arguments else training.presets[preset]
+    base = start(asked.stage)
+    if "--resume" in arguments:
+        saved = saved_config(arguments, base)
+        if saved is not None:
+            return _parsed(training, arguments, saved, file)
+    base = replace(base, teacher=asked.teacher or installed_teacher(base.teacher))
+    base = training.begin_from(base, value_of(arguments, "--init"))
+    return _parsed(training, arguments, base, file)
+
+
+def _parsed(
+    training: StagedTraining[Cfg], arguments: list[str], base: Cfg, file: ConfigFile | None
+) -> Cfg:
+    """Every flag, with the values of ``file`` and ``base`` for the others."""
+    base = base if file is None else file.over(base)
+    prog = f"vd-train {training.name}"
+    cfg: Cfg = parse(type(base), arguments, default=base, prog=prog, description=training.help)
+    teacher = [] if cfg.teacher is None else [cfg.teacher]
+    check_names(teacher, (*cfg.task.objects, *cfg.task.validation))
+    return cfg
+
+
+def run_stage(training: StagedTraining[Cfg], arguments: list[str]) -> int:
+    """The command; its exit status."""
+    cfg = parse_stage(training, arguments)
+    if is_main():
+        words: list[object] = ["--stage", cfg.stage, "--preset", cfg.preset]
+        words += ["--teacher", cfg.teacher]
+        words += [] if cfg.init is None else ["--init", cfg.init]
+        say_same_as("vd-train", training.name, *words, "--out", cfg.run.out)
+    with run_folder(cfg) as own:
+        return train_stage(own, training)
+
+
+def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
+    """Train as ``cfg`` says; the exit status."""
+    folder = cfg.run.out
+    say = say_of_main()
+    cfg.validate()
+    trainer = training.build(cfg, say)
+    if trainer.iteration:
+        say(f"resumed after iteration {trainer.iteration} of {trainer.total_iterations}")
+    elif cfg.init is not None:
+        say(f"begins with the weights of {cfg.init}")
+    elif cfg.stage:
+        say(f"begins from nothing: stage {cfg.stage - 1} was not trained; --init names a network")
+    if not trainer.run_to_end():
+        if not cfg.smoke:
+            say(f"saved in {folder}; go on with: vd-train {training.name} --out {folder} --resume")
+        return interrupt.INTERRUPTED
+    if cfg.smoke:
+        say("done: everything runs, and the network is of no use")
+    else:
+        say(f"done: {folder / training.result}; tensorboard --logdir {folder} draws the curves")
+    return 0
+
+
+def task_of_teacher(
+    teacher: "TrainedPolicy", chosen: StageTaskCfg, condition: RandomisationCfg | None = None
+) -> ReorientCfg:
+    """The environments of a teacher's training, randomised as they were or as ``condition`` says."""
+    from vd.policy.agents import task_for
+
+    trained = ReorientCfg.of(teacher)
+    return task_for(
+        teacher,
+        objects=chosen.objects or trained.objects,
+        num_envs=chosen.num_envs,
+        seed=chosen.seed,
+        stop_tolerance_rad=PAPER.success.rotation_rad,
+        episode_s=trained.episode_s,
+        randomised=trained.randomisation.enabled,
+        condition=condition,
+        success_ends_episode=False,
+    )
+
+
+def build_stage(
+    cfg: Cfg,
+    kind: str,
+    *,
+    network_of: Callable[[Cfg, "TrainedPolicy", str], Network],
+    trainer_of: Callable[[Cfg, "TrainedPolicy", Network, str], Trainer],
+    say: Callable[[str], object],
+) -> Trainer:
+    """Build a trainer as ``cfg`` says, save the configuration, and resume if asked.
+
+    Args:
+        cfg: Configuration.
+        kind: Of its network, in checkpoints.
+        network_of: Makes the network of settings and teacher on a device; it begins from ``init``
+            if there is one, of which a run that goes on has none.
+        trainer_of: Makes the trainer of settings, teacher, network and device.
+        say: Is told when the slow part begins.
+
+    Raises:
+        FileExistsError: The run folder holds another run and ``resume`` is not set.
+        FileNotFoundError: There is no such teacher, network or checkpoint.
+        ValueError: The settings do not fit each other, or the network to begin from.
+    """
+    from vd.train.checkpoint import find_checkpoint
+
+    check_folder(cfg.run.out)
+    device = resolve_device(cfg.run.device)
+    checkpoint = find_checkpoint(cfg.run.out, cfg.resume, kind)
+    if cfg.teacher is None:
+        raise ValueError(
+            "--teacher is missing; give a policy.safetensors, a run's folder or a name"
+        )
+    say(BUILDING)
+
+    import torch
+
+    quiet_warp()  # a line for each of some hundred kernels would scroll the progress away
+    from vd.command.workers import one_thread_without_gpu
+    from vd.policy.agents import open_teacher
+
+    teacher = open_teacher(cfg.teacher, device)
+    if teacher is None:
+        raise ValueError(f"--teacher {cfg.teacher} has no layers; give a trained teacher")
+    one_thread_without_gpu(device)
+    torch.set_float32_matmul_precision("high")
+    # The network is the same in all processes, what they draw is not.
+    torch.manual_seed(cfg.task.seed)
+    begun = cfg if checkpoint is None else replace(cfg, init=None)
+    network = network_of(begun, teacher, device)
+    own_seed = cfg.task.seed + int(os.environ.get("RANK", "0"))
+    torch.manual_seed(own_seed)
+    own = replace(cfg, task=replace(cfg.task, seed=own_seed))
+    trainer = trainer_of(own, teacher, network, device)
+    if checkpoint is not None:
+        trainer.load(checkpoint)
+    if is_main():
+        # After all that can refuse: settings that a run cannot have must not take the place of its
+        # own.
+        write_config(cfg)
+    return trainer
