@@ -254,8 +254,8 @@ def test_pictures_of_tags_give_the_layer_that_the_loop_reads(
 
 
 def test_a_bad_condition_is_warned_of(hand, lens, poses, camera, tmp_path, capsys, monkeypatch):
-    """Ten pictures, in which the joints are off by 1.5 degrees, determine little."""
-    bench = Bench(hand, lens, np.repeat(poses[0], 2, axis=0), camera, joint_rad=np.radians(1.5))
+    """Ten pictures, in which the joints are off by 0.7 degrees, determine little."""
+    bench = Bench(hand, lens, np.repeat(poses[0], 2, axis=0), camera, joint_rad=np.radians(0.7))
     assert calibrated(bench, monkeypatch, out=tmp_path / "c.usda") == 1
     assert "ill-conditioned" in capsys.readouterr().out
 

@@ -53,15 +53,15 @@ def test_both_engines_move_alike_in_equal_steps(changes):
     """Objects fall, land, and are pushed.
 
     Single precision leaves 0.01 mm, and in one world of some a contact that begins a step later.
-    Of three draws in each case three quarters of the joints agree within 3e-6 rad, nine tenths of
-    the objects' coordinates within 0.5 mm. A mass that did not arrive makes the latter 2.5 mm,
+    Of four draws in each case three quarters of the joints agree within 3e-6 rad, nine tenths of
+    the objects' coordinates within 1.3 mm. A mass that did not arrive makes the latter 2.5 mm,
     a friction 42, a centre of mass 45.
     """
     newton, mujoco = (moved(make(engine, **changes), 8) for engine in ("newton", "mujoco"))
     assert np.ptp(newton[:, :, 11], axis=0).min() > 0.01, "all fell"
     apart = np.abs(mujoco - newton)
     assert np.quantile(apart[:, :, :9], 0.75) < 3e-5
-    assert np.quantile(apart[:, :, 9:], 0.9) < 1e-3
+    assert np.quantile(apart[:, :, 9:], 0.9) < 2e-3
     assert not np.array_equal(mujoco, newton), "two engines"
 
 

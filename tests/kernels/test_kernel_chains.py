@@ -276,7 +276,11 @@ def integrate(rows, time, command, start, dt, stops=np.inf):
 
 DETERMINISTIC = [name for name in EFFECTS if name not in ("command_jitter", "joint_coupling")]
 DRAWS = 6
-SIZES = {"thermal_drift.rate_per_s": 0.2, "gravity_load.phase_rad": 0.5}
+SIZES = {
+    "thermal_drift.rate_per_s": 0.2,
+    "gravity_load.phase_rad": 0.5,
+    "torque_speed_limit.tau_stall_nm": 0.4,
+}
 """Sizes in place of the typical ones, to be seen in two seconds."""
 
 

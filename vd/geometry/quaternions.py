@@ -37,8 +37,8 @@ def relative_rotation(first: Array, second: Array) -> Array:
 def rotation_distance(first: Array, second: Array) -> Array:
     """Angle between orientations, quaternions xyzw [..., 4], in [0, pi] [rad]."""
     xp = library_of(first)
-    vector = relative_rotation(first, second)[..., :3]
-    return 2.0 * xp.asin(xp.linalg.vector_norm(vector, axis=-1).clip(max=1.0))
+    turn = relative_rotation(first, second)
+    return 2.0 * xp.atan2(xp.linalg.vector_norm(turn[..., :3], axis=-1), abs(turn[..., 3]))
 
 
 def rotated(quat: Array, vector: Array) -> Array:
