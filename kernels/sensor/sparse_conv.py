@@ -57,7 +57,8 @@ def kernel_map_kernel(
                 offset = key_coordinates(input_key_in[place] & _MORTON_MASK) - cell
                 if wp.max(wp.abs(offset)) <= step:
                     offset = offset / step
-                    table_out[row, 13 + 9 * offset[0] + 3 * offset[1] + offset[2]] = place
+                    tap = 9 * offset[0] + 3 * offset[1] + offset[2]
+                    table_out[row, _KERNEL // 2 + tap] = place
                 place += 1
 
 

@@ -30,9 +30,12 @@ SHIFT_M = 0.04
 TURN_RAD, MOVE_M = 0.25, 0.003
 """Largest turn of an object in a step, as of teachers, and standard deviation of its motion."""
 FIRST_TURN_RAD = 0.6
-"""Beliefs are first off by up to this [rad]: among larger errors small ones are not learned."""
-LEFT, WIDER = 0.5, 1.05
-"""Where no more than this share of the error is left after a sequence, the largest grows so."""
+"""Beliefs are first off by up to this [rad]: among larger errors small ones are not learned. Of four
+meshes pi taught no rotation in 900 steps, this did; half and twice were not tried."""
+LEFT = 0.5
+"""Share of the error that may be left after a sequence for the largest to grow. Not tuned."""
+WIDER = 1.05
+"""By what factor it grows. Not tuned."""
 
 
 def turned(rotation: Tensor, most: float) -> Tensor:

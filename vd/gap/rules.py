@@ -235,7 +235,7 @@ def late_side(telemetry: Telemetry) -> str:
 
 
 def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[str]]:
-    """The models that differ from one in the member of one family, or have two for one that is the same.
+    """The models next to one: with another member of one family, or two effects for the same one.
 
     Args:
         effects: Of the model.
@@ -358,7 +358,7 @@ def best_of(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
 
 
 def contains(larger: JointFit, smaller: JointFit) -> bool:
-    """Whether a model is another with something added, or with a more general effect in place of one."""
+    """Whether a model is another with something added, or with a more general effect for one."""
     covered = {*larger.effects}
     for name in larger.effects:
         covered.update(CONTAINS.get(name, ()))
@@ -381,7 +381,8 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
         certain = held_out > 0.0
     else:
         gain, before = min(fitted, held_out), smaller.held_out_rmse
-        certain = np.greater(*paired(evidence, larger, smaller))
+        gained, error = paired(evidence, larger, smaller)
+        certain = gained > error
     if gain < MIN_GAIN:
         return f"removes {percent(gain)} of the error, less than {percent(MIN_GAIN)}"
     if before * np.sqrt(1.0 - (1.0 - gain) ** 2) < np.sqrt(NO_GAP**2 - 1.0) * evidence.floor:
@@ -518,8 +519,8 @@ def conclude(
     share = recovered(evidence, plain, good[0])
     if share < RECOVERED:
         text = (
-            f"the best model, {model_text(good[0].effects)}, recovers {percent(share)} of the squared gap, "
-            "less than half"
+            f"the best model, {model_text(good[0].effects)}, recovers {percent(share)} "
+            "of the squared gap, less than half"
         )
         return Conclusion("unknown", text, plain, tuple(good), weights)
     names = tuple(name for name in good[0].effects if all(name in fit.effects for fit in good))
