@@ -5,7 +5,6 @@ from typing import Any
 
 import newton
 import numpy as np
-import torch
 import warp as wp
 
 from vd.assets_usd.objects.model import ObjectModel
@@ -138,22 +137,18 @@ class Randomiser:
         own_mass = model.body_mass.numpy().copy().reshape(n, -1)[:, scene.object_body]
         if not self.enabled:  # nothing is drawn: objects weigh what their files say
             self.object_mass.assign(own_mass)
-        drawn_mass = self.object_mass.numpy().copy()
-        factor = np.ones((n, scene.bodies_per_world))
-        factor[:, scene.link_body] = link_scale.numpy()
-        factor[:, scene.object_body] = drawn_mass / own_mass
-        # A level can move after each update: what it scales stays on the device.
-        place = wp.device_to_torch(state.device)
-        self._own_mass = torch.tensor(own_mass, device=place)
-        self._drawn_mass = torch.tensor(drawn_mass, device=place)
-        self._mass_factor = torch.tensor(factor.reshape(-1), device=place)
+        self._own_mass = own_mass
+        self._drawn_mass = self.object_mass.numpy().copy()
+        self._mass_factor = np.ones((n, scene.bodies_per_world))
+        self._mass_factor[:, scene.link_body] = link_scale.numpy()
+        self._mass_factor[:, scene.object_body] = self._drawn_mass / own_mass
         inertial = (
             model.body_mass,
             model.body_inv_mass,
             model.body_inertia,
             model.body_inv_inertia,
         )
-        self._inertial = [(array, array.clone()) for array in map(wp.to_torch, inertial)]
+        self._inertial = [(array, array.numpy().copy()) for array in inertial]
         shift = state.cfg.randomisation.object_com_m
         if self.enabled and shift > 0.0:
             direction = np.random.default_rng(state.cfg.seed).normal(size=(n, 3))
@@ -165,13 +160,12 @@ class Randomiser:
 
     def set_masses(self, level: float) -> None:
         """Give links and objects the masses of their files at level 0 of physics, those drawn at 1."""
-        object_mass = blend(self._own_mass, self._drawn_mass, level)
-        wp.to_torch(self.object_mass).copy_(object_mass)
-        factor = self._mass_factor**level
+        self.object_mass.assign(blend(self._own_mass, self._drawn_mass, level))
+        factor = self._mass_factor.reshape(-1) ** level
         inverse = 1.0 / factor
         scales = (factor, inverse, factor[:, None, None], inverse[:, None, None])
         for (array, own), scale in zip(self._inertial, scales, strict=True):
-            array.copy_(own * scale)
+            array.assign((own * scale).astype(np.float32))
         flags = newton.ModelFlags.BODY_INERTIAL_PROPERTIES
         self._state.sim.solver.notify_model_changed(flags)
 
