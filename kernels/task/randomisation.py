@@ -151,6 +151,30 @@ def draw_masses_kernel(
 
 
 @wp.kernel
+def scale_masses_kernel(
+    level: float,  # in [0, 1]: 0 scales nothing, 1 by the whole factor, in between geometrically
+    # Model:
+    factor: wp.array[float],  # [B] factor on the mass of each body
+    own_mass: wp.array[float],  # [B] mass before [kg]
+    own_inv_mass: wp.array[float],  # [B] and its inverse, 0 of what does not move [1/kg]
+    own_inertia: wp.array[wp.mat33],  # [B] inertia before [kg m^2]
+    own_inv_inertia: wp.array[wp.mat33],  # [B] and its inverse [1/(kg m^2)]
+    # Out:
+    mass_out: wp.array[float],  # [B] mass [kg]
+    inv_mass_out: wp.array[float],  # [B] inverse [1/kg]
+    inertia_out: wp.array[wp.mat33],  # [B] inertia [kg m^2]
+    inv_inertia_out: wp.array[wp.mat33],  # [B] inverse [1/(kg m^2)]
+):
+    """Scale masses, and inertias with them. Launch: [B]."""
+    body = wp.tid()
+    scale = wp.pow(factor[body], level)
+    mass_out[body] = scale * own_mass[body]
+    inv_mass_out[body] = own_inv_mass[body] / scale
+    inertia_out[body] = scale * own_inertia[body]
+    inv_inertia_out[body] = own_inv_inertia[body] / scale
+
+
+@wp.kernel
 def disturbance_force_kernel(
     # Model:
     object_mass: wp.array[float],  # [N] mass of the object [kg]

@@ -13,6 +13,7 @@ from vd.kernels.task.randomisation import (
     draw_dynamics_kernel,
     draw_masses_kernel,
     draw_servo_kernel,
+    scale_masses_kernel,
 )
 from vd.paper import PAPER
 
@@ -151,6 +152,24 @@ def test_masses_have_the_ranges_of_table_s3(device):
         assert_uniform(scale[:, link], DR.link_mass_scale)
     assert_uniform(mass, DR.object_mass_kg)
     assert_uncorrelated(np.column_stack([scale, mass]), 0.05)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3, 1.0])
+def test_masses_and_inertias_scale_geometrically_and_what_does_not_move_stays_so(device, level):
+    rng, bodies = np.random.default_rng(6), 50
+    factor = rng.uniform(0.05, 20.0, bodies)
+    mass = rng.uniform(0.001, 1.0, bodies)
+    inertia = rng.normal(size=(bodies, 3, 3))
+    moves = np.arange(bodies) % 5 > 0
+    inverse_mass = np.where(moves, 1.0 / mass, 0.0)
+    inverse = np.where(moves[:, None, None], np.linalg.inv(inertia), 0.0)
+    own = [factor, mass, inverse_mass, inertia, inverse]
+    scaled = launch(scale_masses_kernel, bodies, [level, *own], device, *[bodies] * 4)
+    scale = factor**level
+    squares = scale[:, None, None]
+    expected = [mass * scale, inverse_mass / scale, inertia * squares, inverse / squares]
+    for found, wanted in zip(scaled, expected, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=2e-5)
 
 
 @EXAMPLES

@@ -8,7 +8,6 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.envs.curriculum import blend
 from vd.envs.servo import gain_scales, plain_servos
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
@@ -24,6 +23,7 @@ from vd.kernels.task.randomisation import (
     draw_dynamics_kernel,
     draw_masses_kernel,
     draw_servo_kernel,
+    scale_masses_kernel,
 )
 from vd.paper import PAPER
 from vd.sim.graphs import Graphs
@@ -56,8 +56,9 @@ class Randomiser:
         self.hand_friction = zeros(n, saved="hand_friction")
         self.object_friction = zeros(n, saved="object_friction")
         self.table_friction = zeros(n, saved="table_friction")
-        self.object_mass = zeros(n)
-        """Object mass [kg], shape [N]."""
+        model, scene = state.sim.model, state.scene
+        self.object_mass = model.body_mass.reshape((n, -1))[:, scene.object_body]
+        """Object mass [kg], shape [N], where the model holds it."""
         self.action_offset = zeros(n, d, saved="action_offset")
         # Not of the shape's values, which no sensor measures.
         size = teacher_observation_size(state.num_fingers, state.num_joints)
@@ -74,7 +75,6 @@ class Randomiser:
         self._push_interval = round(PUSH_INTERVAL_S * cfg.sim.control_hz)
         self._graphs = Graphs(device)
 
-        model, scene = state.sim.model, state.scene
         self._nominal_kp = wp.array(state.hand.kp, dtype=float, device=device)
         self._nominal_kd = wp.array(state.hand.kd, dtype=float, device=device)
         kp_scale, kd_scale = gain_scales(state.hand, cfg.randomisation)
@@ -124,48 +124,42 @@ class Randomiser:
 
     def _draw_masses(self) -> None:
         """Draw link and object masses, with which inertias scale, and where the objects' centres are."""
-        state = self._state
+        state, scene = self._state, self._state.scene
         n, model = state.num_envs, state.sim.model
-        link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
+        link_scale = wp.ones((n, len(scene.link_body)), dtype=float, device=state.device)
+        drawn = state.zeros(n)
         everywhere = wp.ones(n, dtype=wp.int32, device=state.device)
         state.launch(
             draw_masses_kernel,
             [self._object_mass, state.parameters.randomisation, everywhere, state.rng],
-            [link_scale, self.object_mass],
+            [link_scale, drawn],
         )
-        scene = state.scene
-        own_mass = model.body_mass.numpy().copy().reshape(n, -1)[:, scene.object_body]
-        if not self.enabled:  # nothing is drawn: objects weigh what their files say
-            self.object_mass.assign(own_mass)
-        self._own_mass = own_mass
-        self._drawn_mass = self.object_mass.numpy().copy()
-        self._mass_factor = np.ones((n, scene.bodies_per_world))
-        self._mass_factor[:, scene.link_body] = link_scale.numpy()
-        self._mass_factor[:, scene.object_body] = self._drawn_mass / own_mass
-        inertial = (
+        factor = np.ones((n, scene.bodies_per_world))
+        factor[:, scene.link_body] = link_scale.numpy()
+        if self.enabled:  # else objects weigh what their files say
+            factor[:, scene.object_body] = drawn.numpy() / self.object_mass.numpy()
+        self._mass_factor = wp.array(factor.ravel(), dtype=float, device=state.device)
+        self._inertial = [
             model.body_mass,
             model.body_inv_mass,
             model.body_inertia,
             model.body_inv_inertia,
-        )
-        self._inertial = [(array, array.numpy().copy()) for array in inertial]
+        ]
+        self._own_inertial = [wp.clone(array) for array in self._inertial]
         shift = state.cfg.randomisation.object_com_m
         if self.enabled and shift > 0.0:
             direction = np.random.default_rng(state.cfg.seed).normal(size=(n, 3))
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
             centre = model.body_com.numpy().reshape(n, -1, 3)
-            centre[:, state.scene.object_body] += shift * direction
+            centre[:, scene.object_body] += shift * direction
             model.body_com.assign(centre.reshape(-1, 3))
         self.set_masses(1.0)
 
     def set_masses(self, level: float) -> None:
         """Give links and objects the masses of their files at level 0 of physics, those drawn at 1."""
-        self.object_mass.assign(blend(self._own_mass, self._drawn_mass, level))
-        factor = self._mass_factor.reshape(-1) ** level
-        inverse = 1.0 / factor
-        scales = (factor, inverse, factor[:, None, None], inverse[:, None, None])
-        for (array, own), scale in zip(self._inertial, scales, strict=True):
-            array.assign((own * scale).astype(np.float32))
+        own = [level, self._mass_factor, *self._own_inertial]
+        count = len(self._mass_factor)
+        self._state.launch(scale_masses_kernel, own, self._inertial, dim=count)
         flags = newton.ModelFlags.BODY_INERTIAL_PROPERTIES
         self._state.sim.solver.notify_model_changed(flags)
 
