@@ -134,6 +134,18 @@ def test_weights_that_are_others_are_refused(path):
         read_policy(path)
 
 
+@pytest.mark.parametrize("name", ["dclaw4", "dclaw3-vision"])
+def test_a_training_that_rounds_products_reads_and_writes_policies(name, device, tmp_path):
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        policy = read_policy(SHIPPED_POLICIES[name], device)
+        write_policy(policy, tmp_path / "policy.safetensors")
+    finally:
+        torch.set_float32_matmul_precision(before)
+    read_policy(tmp_path / "policy.safetensors")
+
+
 def test_golden_values_are_of_the_network_of_a_vision_policy_too(tmp_path):
     path = tmp_path / "vision.safetensors"
     path.write_bytes(SHIPPED_POLICIES["dclaw3-vision"].read_bytes())

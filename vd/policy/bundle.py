@@ -33,7 +33,7 @@ GOLDEN_M = 0.03
 object's.
 """
 TOLERANCE = 5e-3
-"""Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and
+"""Largest difference of an output from the golden one. Actions are of size 1; processors and
 other versions of torch differ by 1e-6 to 1e-3."""
 
 AnyPolicy = TrainedPolicy | TrackingPolicy | StudentPolicy
@@ -55,15 +55,16 @@ def write_policy(policy: AnyPolicy, path: Path, contract: Contract | None = None
     from safetensors.torch import save
 
     check_suffix(path, SUFFIX)
-    parts = _weights(policy)
-    golden = _golden_inputs(policy)
-    parts["golden"] = golden | _answers(policy, golden)
+    contract = contract or policy.contract
     tensors = {}
-    for part, weights in parts.items():
+    for part, weights in _weights(policy).items():
         for name, value in weights.items():
             tensors[f"{part}.{name}"] = value.detach().cpu().contiguous()
+    golden = _golden_inputs(policy)
+    golden |= _answers(_policy_of(contract, tensors, "cpu"), golden)
+    tensors |= {f"golden.{name}": value.contiguous() for name, value in golden.items()}
     tensors[SEAL_KEY] = torch.tensor(list(UNSEALED), dtype=torch.uint8)  # bytes stand last
-    data = save(tensors, {CONTRACT_KEY: contract_text(contract or policy.contract)})
+    data = save(tensors, {CONTRACT_KEY: contract_text(contract)})
     with atomic_path(path) as temporary:
         temporary.write_bytes(sealed(data))
 
@@ -97,8 +98,8 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
     tensors = load(data)
     golden = _part(tensors, "golden.")
     try:
-        policy = _policy_of(contract, tensors, device)
-        answers = _answers(policy, {name: value.to(device) for name, value in golden.items()})
+        policy = _policy_of(contract, tensors, "cpu")
+        answers = _answers(policy, golden)
     except (KeyError, RuntimeError) as error:
         first = " ".join(str(error).split("\n\t")[:2])  # of torch's list of what does not fit
         raise ContractError(
@@ -111,7 +112,7 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
             f"{path}: the policy's outputs differ by {worst:.2g} from the golden ones in it (at "
             f"most {TOLERANCE:g}); other software wrote it ({contract.software}): take that"
         )
-    return policy
+    return policy if device == "cpu" else _policy_of(contract, tensors, device)
 
 
 def _weights(policy: AnyPolicy) -> dict[str, Tensors]:
@@ -168,37 +169,45 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
 
 
 def _answers(policy: AnyPolicy, golden: Tensors) -> Tensors:
-    """What a policy makes of golden inputs on its device: ``action`` [S, D].
+    """What a policy on the CPU makes of golden inputs, by products that are not rounded as in training.
 
-    Of a network of alignment and a student also ``rotation``, matrices [S, 3, 3].
+    ``action`` [S, D], of a network of alignment and a student also ``rotation``, matrices [S, 3, 3].
     """
+    rounding = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        return _outputs(policy, golden)
+    finally:
+        torch.set_float32_matmul_precision(rounding)
+
+
+def _outputs(policy: AnyPolicy, golden: Tensors) -> Tensors:
+    """The outputs of a policy on the CPU to golden inputs."""
     if isinstance(policy, StudentPolicy):
         return _student_answers(policy.network, golden)
     teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-    answers = {"action": teacher.act(golden["observation"]).cpu()}
+    answers = {"action": teacher.act(golden["observation"])}
     if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
         with torch.no_grad():
             turn = policy.alignment(golden["goal_points"], golden["seen_points"]).rotation
-        answers["rotation"] = turn.cpu()
+        answers["rotation"] = turn
     return answers
 
 
 def _student_answers(network: Student, golden: Tensors) -> Tensors:
     """What a student makes of clouds of objects that are believed to be turned as wanted."""
-    device = next(network.parameters()).device
-    given = {name: value.to(device) for name, value in golden.items()}
-    rotation = torch.eye(3, device=device).repeat(STATES, 1, 1)
+    rotation = torch.eye(3).repeat(STATES, 1, 1)
     sight = StudentInput(
-        camera=given["camera"],
-        hand=given["hand"],
-        goal=given["goal"],
+        camera=golden["camera"],
+        hand=golden["hand"],
+        goal=golden["goal"],
         goal_rotation=rotation,
-        proprioception=given["proprioception"],
-        belief=Belief(rotation, torch.zeros((STATES, 3), device=device)),
+        proprioception=golden["proprioception"],
+        belief=Belief(rotation, torch.zeros((STATES, 3))),
     )
     with torch.no_grad():
         output = network.act(sight, network.first_hidden(STATES))
-    return {"action": output.mean.cpu(), "rotation": output.belief.rotation.cpu()}
+    return {"action": output.mean, "rotation": output.belief.rotation}
 
 
 def _part(tensors: Tensors, prefix: str) -> Tensors:
