@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.policy.senses import Senses
+from vd.train.student.sequences import Sequences, flow_loss
 from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
 from vd.vision.rotations import (
@@ -20,11 +22,21 @@ from vd.vision.rotations import (
     turn_angle,
 )
 from vd.vision.sparse import voxelise
-from vd.vision.student import Belief, InputBuilder, Student, StudentInput, carried, each
+from vd.vision.student import (
+    Belief,
+    Flow,
+    InputBuilder,
+    Look,
+    Student,
+    StudentInput,
+    carried,
+    each,
+    rigid_motion,
+)
 
 JOINTS = 9
 SMALL = StudentCfg(
-    channels=(8, 16), blocks=1, embedding=32, senses=16, memory=32, head=32, voxel_m=0.01
+    channels=(8, 16), blocks=1, embedding=32, flow=32, senses=16, memory=32, head=32, voxel_m=0.01
 )
 
 
@@ -121,24 +133,23 @@ def test_a_scene_moved_with_the_belief_looks_the_same():
     moved = dataclasses.replace(
         sight, camera=sight.camera + shift, hand=sight.hand + shift, belief=belief
     )
-    torch.testing.assert_close(
-        network.encode(moved)[0], network.encode(sight)[0], atol=2e-3, rtol=0.0
-    )
+    seen = network.look(sight).embedding
+    torch.testing.assert_close(network.look(moved).embedding, seen, atol=2e-3, rtol=0.0)
     aside = dataclasses.replace(sight, belief=belief)
-    assert (network.encode(aside)[0] - network.encode(sight)[0]).abs().max() > 0.05
+    assert (network.look(aside).embedding - seen).abs().max() > 0.05
 
 
 def test_it_reads_nothing_out_of_reach():
     network = student()
     sight = sights((2,))
     far = sight.belief.position[:, None] + torch.tensor([0.0, 0.0, SMALL.reach_m])
-    read, count = network.encode(sight)
+    read = network.look(sight)
     for step, seen in ((1.01, False), (0.95, True)):
         points = sight.belief.position[:, None] + step * (far - sight.belief.position[:, None])
         camera = torch.cat([sight.camera, points], dim=1)
-        found, voxels = network.encode(dataclasses.replace(sight, camera=camera))
-        assert torch.allclose(found, read, atol=1e-6) != seen
-        assert (voxels == count + seen).all()
+        found = network.look(dataclasses.replace(sight, camera=camera))
+        assert torch.allclose(found.embedding, read.embedding, atol=1e-6) != seen
+        assert (found.voxels == read.voxels + seen).all()
 
 
 def senses_of(hand, envs: int, place: torch.device) -> Senses:
@@ -195,14 +206,16 @@ def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(devic
 def test_a_belief_strays_no_farther_than_the_network_sees():
     network = student().eval()
     with torch.no_grad():
-        network.residual.bias[-3:] = 0.5  # 9 cm in every step
-    acting = ActingStudent(network, load_hand("dclaw3"), torch.randn(2, 50, 3))
+        network.flow[-1].bias[:3] = 0.5  # 9 cm in every step
+    acting = ActingStudent(network, load_hand("dclaw3"), 0.02 * torch.randn(2, 50, 3))
     senses = senses_of(load_hand("dclaw3"), 2, torch.device("cpu"))
+    first = acting.build.first_belief(senses.goal_quat)
+    in_sight = first.position[:, None] + 0.02 * torch.randn(2, 40, 3)
+    senses = dataclasses.replace(senses, points=in_sight)
     acting.step(senses)
     senses = dataclasses.replace(senses, fresh=torch.zeros(2, dtype=torch.bool))
     for _ in range(5):
         acting.step(senses)
-    first = acting.build.first_belief(senses.goal_quat)
     strayed = (acting.belief.position - first.position).norm(dim=-1)
     torch.testing.assert_close(strayed, torch.full((2,), SMALL.reach_m))
 
@@ -212,25 +225,120 @@ def each_row(senses: Senses, rows: list[int]) -> Senses:
     return Senses(**taken)
 
 
-def test_it_learns_by_what_rotation_a_belief_is_wrong():
+def test_a_rigid_motion_is_that_of_the_voxels_which_are_sure(device):
+    """Against SciPy's weighted fit; voxels that are not sure count for nothing."""
+    place = torch.device(wp.device_to_torch(device))
+    random = np.random.default_rng(3)
+    looks = 5
+    look = np.repeat(np.arange(looks), 40)
+    start = random.normal(0.0, 0.03, (len(look), 3))
+    turns = Rotation.random(looks, rng=random)
+    moved = np.concatenate([turns[k].apply(start[look == k]) for k in range(looks)])
+    shift = moved + random.normal(0.0, 0.02, (looks, 3))[look] - start
+    shift += random.normal(0.0, 0.002, shift.shape)
+    log_scale = random.uniform(-1.0, 1.0, len(look))
+    wrong = random.random(len(look)) < 0.2
+    shift[wrong] += 0.1
+    log_scale[wrong] = 12.0
+
+    def tensor(values):
+        return torch.tensor(values, dtype=torch.float32, device=place)
+
+    flow = Flow(tensor(start), tensor(shift), tensor(log_scale), torch.tensor(look, device=place))
+    rotation, translation = rigid_motion(flow, looks)
+    for k in range(looks):
+        rows = (look == k) & ~wrong
+        weight = np.exp(-2.0 * log_scale[rows])
+        before = np.average(start[rows], axis=0, weights=weight)
+        end = start[rows] + shift[rows]
+        after = np.average(end, axis=0, weights=weight)
+        fit, _ = Rotation.align_vectors(end - after, start[rows] - before, weights=weight)
+        np.testing.assert_allclose(rotation[k].cpu(), fit.as_matrix(), atol=2e-3)
+        expected = after - fit.apply(before)
+        np.testing.assert_allclose(translation[k].cpu(), expected, atol=2e-4)
+
+
+def test_about_a_line_nothing_is_turned():
+    start = torch.linspace(-0.05, 0.05, 20)[:, None] * torch.tensor([[0.6, 0.0, 0.8]])
+    axis = torch.tensor([[0.0, 1.0, 0.0]])
+    turn = matrices_about(axis, torch.tensor([0.3]))
+    shift = carried(start[None], turn)[0] - start
+    still = torch.zeros(20)
+    rotation, _ = rigid_motion(Flow(start, shift, still, torch.zeros(20).long()), 1)
+    torch.testing.assert_close(rotation, turn, atol=1e-3, rtol=0.0)
+
+
+def truth_of(sight: StudentInput) -> Belief:
+    """Where goals lie on what is seen, by least squares."""
+    seen = sight.camera - sight.belief.position[..., None, :]
+    u, _, vt = torch.linalg.svd(sight.goal.transpose(-1, -2) @ seen)
+    return Belief((u @ vt).transpose(-1, -2), sight.belief.position)
+
+
+def test_it_learns_how_a_belief_is_wrong():
     """Eight objects half a radian off are turned right after a few dozen steps."""
     network = student().train()
     sight = sights((1, 8), points=200)
-    seen = sight.camera - sight.belief.position[..., None, :]
-    # What carries the goal's cloud onto what is seen, by least squares.
-    u, _, vt = torch.linalg.svd(sight.goal.transpose(-1, -2) @ seen)
-    truth = (u @ vt).transpose(-1, -2)
-    off = turn_angle(sight.belief.rotation @ truth.transpose(-1, -2))
+    truth = truth_of(sight)
+    off = turn_angle(sight.belief.rotation @ truth.rotation.transpose(-1, -2))
     torch.testing.assert_close(off, torch.full((1, 8), 0.5), atol=1e-3, rtol=0.0)
+    done = torch.zeros((1, 8), dtype=torch.bool)
+    sequences = Sequences(sight, truth, network.first_hidden(8), done)
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
     for _ in range(60):
-        found = network(sight, network.first_hidden(8)).belief
-        loss = (found.rotation - truth).square().sum((-1, -2)).mean()
+        output = network(sight, network.first_hidden(8))
+        loss = flow_loss(output, sequences)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    left = turn_angle(found.rotation.detach() @ truth.transpose(-1, -2))
+    left = turn_angle(output.belief.rotation @ truth.rotation.transpose(-1, -2))
     assert left.mean() < 0.15
+    assert output.flow.log_scale.mean() < 0.0
+
+
+class Told(torch.nn.Module):
+    """A network that sets near beliefs right, and doubts those that stay wrong."""
+
+    cfg = SMALL
+
+    def __init__(self, truth: torch.Tensor):
+        super().__init__()
+        self.truth = truth
+
+    def first_hidden(self, envs: int) -> torch.Tensor:
+        """No memory."""
+        return torch.zeros(envs, 1)
+
+    def look(self, sight: StudentInput) -> Look:
+        """The truth where the belief is near it."""
+        rotation = sight.belief.rotation
+        near = turn_angle(rotation.mT @ self.truth) < 1.15
+        better = torch.where(near[:, None, None], self.truth, rotation)
+        doubt = turn_angle(better.mT @ self.truth)
+        return Look(doubt, Belief(better, sight.belief.position), doubt, doubt, None)
+
+
+def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
+    hand = load_hand("dclaw3")
+    senses = senses_of(hand, 2, torch.device("cpu"))
+    truth = quaternion_matrices(random_rotations(1, torch.device("cpu")))[0]
+    acting = ActingStudent(Told(truth), hand, torch.randn(2, 50, 3))
+    middle = torch.tensor([0.01, -0.02, 0.16])
+    seen = middle + 0.02 * torch.randn(2, 40, 3)
+    seen[1] = torch.nan
+    acting.look(dataclasses.replace(senses, points=seen))
+    assert acting.lost.tolist() == [False, True]
+    torch.testing.assert_close(acting.belief.rotation[0], truth)
+    assert (acting.belief.position[0] - middle).norm() < 0.02
+    first = acting.build.first_belief(senses.goal_quat)
+    torch.testing.assert_close(acting.belief.rotation[1], first.rotation[1])
+    later = dataclasses.replace(senses, fresh=torch.zeros(2, dtype=torch.bool))
+    acting.look(dataclasses.replace(later, points=seen.flip(0)))
+    assert not acting.lost.any()
+    torch.testing.assert_close(acting.belief.rotation[1], truth)
+    acting.belief.rotation[0] = torch.eye(3)
+    acting.look(dataclasses.replace(later, points=seen.flip(0)))
+    torch.testing.assert_close(acting.belief.rotation[0], torch.eye(3))
 
 
 def test_it_learns_in_half_precision(device):
@@ -243,7 +351,8 @@ def test_it_learns_in_half_precision(device):
     assert output.mean.dtype == output.belief.rotation.dtype == torch.float32
     torch.testing.assert_close(output.mean, single.mean, atol=0.02, rtol=0.02)
     assert (output.mean != single.mean).any()
-    spoken = [output.mean, output.log_std, output.belief.rotation, output.log_distance]
+    spoken = [output.mean, output.log_std, output.log_distance]
+    spoken += [output.flow.shift, output.flow.log_scale]
     sum(value.square().sum() for value in spoken).backward()
     for name, weight in network.named_parameters():
         assert torch.isfinite(weight.grad).all(), name

@@ -19,14 +19,14 @@ from vd.train.checkpoint import list_checkpoints
 from vd.train.student import made
 from vd.train.student.build import build_student
 from vd.train.student.config import StudentTrainCfg, smoke
-from vd.train.student.sequences import student_losses
+from vd.train.student.sequences import belief_errors, student_losses
 from vd.vision.acting import StudentPolicy
 from vd.vision.cfg import StudentCfg
 from vd.vision.rotations import turn_angle
-from vd.vision.student import Belief, carried
+from vd.vision.student import Belief, carried, each, rigid_motion
 
 TINY = StudentCfg(
-    channels=(8, 16), blocks=1, embedding=32, senses=16, memory=32, head=32, voxel_m=0.01
+    channels=(8, 16), blocks=1, embedding=32, flow=32, senses=16, memory=32, head=32, voxel_m=0.01
 )
 
 
@@ -63,12 +63,12 @@ def test_every_stage_learns_what_it_is_shown(stage, tmp_path):
     for _ in range(25):
         figures = trainer._step(sequences, 0.0)
         first = first or figures
-    names = {"loss/rotation", "loss/position", "loss/distance", "loss/action"}
+    names = {"loss/flow", "loss/distance", "loss/action"}
     assert names - {"loss/action"} <= figures.keys()
     assert ("loss/action" in figures) == (stage > 0)
     for name in names & figures.keys():
         assert figures[name] < first[name], name
-    assert figures["loss/rotation"] < 0.8 * first["loss/rotation"]
+    assert figures["loss/flow"] < first["loss/flow"] - 0.5  # a likelihood half as large again
     trainer._close()
 
 
@@ -120,21 +120,17 @@ def test_truth_is_where_the_objects_points_are(tmp_path):
     trainer._close()
 
 
-def test_beliefs_begin_less_wrong_until_the_student_sets_them_right(tmp_path, monkeypatch):
-    trainer = trainer_of(settings(0, tmp_path))
-    source = trainer.source
-    first = source.most_rad
-    for share, grows in ((0.6, False), (0.4, True)):
-        left = torch.full((4,), share * 0.5 * first)
-        monkeypatch.setattr(made, "last_errors", lambda *_, left=left: (left, left))
-        for sequences in source.minibatches(trainer.acting, lambda: False):
-            belief = sequences.sight.belief
-            turn = belief.rotation[0].transpose(-1, -2) @ sequences.truth.rotation[0]
-            assert turn_angle(turn).max() < first + 1e-3
-        assert (source.most_rad > first) == grows
-    source.most_rad = np.pi
-    list(source.minibatches(trainer.acting, lambda: False))
-    assert source.most_rad == np.pi
+@pytest.mark.parametrize("stage", [0, 1])
+def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
+    cfg = settings(stage, tmp_path, batch=64)
+    trainer = trainer_of(replace(cfg, task=replace(cfg.task, num_envs=64)))
+    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
+    belief = each(sequences.sight.belief, lambda value: value[0])
+    turn, shift = belief_errors(belief, each(sequences.truth, lambda value: value[0]))
+    assert turn.max() < made.AWAY_RAD + 1e-3
+    assert turn.mean() == pytest.approx(0.5 * made.AWAY_RAD, abs=0.2)  # four deviations
+    assert shift.max() < np.sqrt(3.0) * made.AWAY_M + 1e-6
+    trainer._close()
 
 
 def test_losses_are_least_at_the_truth(tmp_path):
@@ -145,11 +141,21 @@ def test_losses_are_least_at_the_truth(tmp_path):
     turn = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation
     distance = turn_angle(turn).clamp(min=0.02).log()
     label = torch.full_like(output.mean, 0.3)
-    right = replace(output, belief=truth, log_distance=distance, mean=label)
+    flow = output.flow
+    believed = each(sequences.sight.belief, lambda value: value[0])
+    moved = truth.rotation[0] @ believed.rotation.mT
+    end = (moved[flow.look] @ flow.start[..., None])[..., 0]
+    end = end + (truth.position[0] - believed.position)[flow.look]
+    sure = torch.full_like(flow.log_scale, -3.0)
+    exact = replace(flow, shift=end - flow.start, log_scale=sure)
+    right = replace(output, flow=exact, log_distance=distance, mean=label)
     labelled = replace(sequences, label=label)
     losses = student_losses(right, labelled, trainer.cfg.learn)
-    assert float(losses["rotation"]) < 2e-3
-    assert float(losses["position"]) == float(losses["distance"]) == 0.0
+    assert float(losses["flow"]) == pytest.approx(-9.0, abs=1e-3)
+    assert float(losses["distance"]) == 0.0
+    rotation, position = rigid_motion(exact, len(moved))
+    torch.testing.assert_close(rotation @ believed.rotation, truth.rotation[0], atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(believed.position + position, truth.position[0])
     # The best deviation is the error that there is.
     off = replace(right, mean=label + 0.1)
     for std, least in ((0.05, False), (0.1, True), (0.2, False)):

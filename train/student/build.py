@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import load_hand
@@ -161,7 +160,6 @@ def _simulated(
     surfaces = mesh_points(simulation.objects, count, torch.device(env.device))[..., :3]
     source = SimulatedSequences(env, teacher, surfaces, cfg, camera)
     acting = ActingStudent(network, simulation.hand, source.goals)
-    acting.belief = acting.build.first_belief(wp.to_torch(simulation.goal_quat))
     # Or all episodes would time out at once.
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, env.max_episode_length)
     return source, acting

@@ -5,12 +5,21 @@ T steps, B sequences, N environments, D actions.
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from vd.policy.senses import Senses
 from vd.train.student.config import LearnCfg
-from vd.vision.rotations import chord, turn_angle
-from vd.vision.student import Belief, InputBuilder, StudentInput, StudentOutput, each
+from vd.vision.rotations import turn_angle
+from vd.vision.student import (
+    SHIFT_M,
+    Belief,
+    InputBuilder,
+    StudentInput,
+    StudentOutput,
+    carried,
+    each,
+)
 
 LEAST_DISTANCE_RAD = 0.02
 """Distances to the goal below this count as this: nothing is stopped as near."""
@@ -59,15 +68,25 @@ def last_errors(belief: Belief, sequences: Sequences) -> tuple[Tensor, Tensor]:
     return belief_errors(belief, each(sequences.truth, lambda value: value[-1]))
 
 
+def flow_loss(output: StudentOutput, sequences: Sequences) -> Tensor:
+    """Negative logarithm of the likelihood of the shifts from beliefs to the truth, a mean over voxels."""
+    flow = output.flow
+    believed = each(sequences.sight.belief, lambda value: value.flatten(0, 1))
+    truth = each(sequences.truth, lambda value: value.flatten(0, 1))
+    turn = truth.rotation @ believed.rotation.mT
+    offset = truth.position - believed.position
+    end = carried(flow.start[:, None], turn[flow.look])[:, 0] + offset[flow.look]
+    off = (flow.start + flow.shift - end).norm(dim=-1) / SHIFT_M
+    return (off * torch.exp(-flow.log_scale) + 3.0 * flow.log_scale).mean()
+
+
 def student_losses(output: StudentOutput, sequences: Sequences, cfg: LearnCfg) -> dict[str, Tensor]:
     """Weighted losses by name, means over all steps."""
     truth = sequences.truth
     to_goal = truth.rotation.mT @ sequences.sight.goal_rotation
     distance = turn_angle(to_goal).clamp(min=LEAST_DISTANCE_RAD)
-    shift = (output.belief.position - truth.position).norm(dim=-1)
     losses = {
-        "rotation": cfg.rotation_weight * chord(output.belief.rotation, truth.rotation).mean(),
-        "position": cfg.position_weight * shift.mean(),
+        "flow": cfg.flow_weight * flow_loss(output, sequences),
         "distance": cfg.distance_weight * (output.log_distance - distance.log()).square().mean(),
     }
     if sequences.label is not None:

@@ -1,6 +1,7 @@
 """Stages 1 and 2: the student acts in simulation, and the teacher says what it would have done (DAgger).
 
-In stage 1 the student is told complete surfaces where the objects truly are, and nothing is
+Where an episode begins the student is told about where the object is, and follows it from there. In
+stage 1 it is told complete surfaces where the objects truly are, and nothing is
 rendered; in stage 2 what a depth camera sees. Rollouts hold what clouds are made of rather than
 clouds (0.4 kB a step; with a camera also its points). T steps, N environments, D joints, K points.
 """
@@ -21,6 +22,7 @@ from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import StudentTrainCfg
+from vd.train.student.made import off
 from vd.train.student.sequences import Sequences, belief_errors, inputs_of
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
@@ -99,7 +101,7 @@ class SimulatedSequences:
                 return None
             pose = poses_in(self._base, self._pose)
             senses = self.senses(pose)
-            sight = acting.look(senses)
+            sight = acting.look(senses, off(acting.build.belief_of(pose)))
             label = self.labels()
             self._keep(step, senses, acting.belief, pose, label)
             output = acting.decide(sight)

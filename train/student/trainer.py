@@ -104,6 +104,7 @@ class StudentTrainer(SupervisedLoop):
         if self.env is not None:
             state["belief"] = vars(self.acting.belief)
             state["hidden"] = self.acting.hidden
+            state["lost"] = self.acting.lost
         return state
 
     def _restore_process(self, state: dict[str, Any]) -> None:
@@ -112,6 +113,7 @@ class StudentTrainer(SupervisedLoop):
         if self.env is not None:
             self.acting.belief = Belief(**state["belief"])
             self.acting.hidden = state["hidden"]
+            self.acting.lost = state["lost"]
 
     def _close(self) -> None:
         self.source.close()

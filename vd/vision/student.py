@@ -2,17 +2,18 @@
 
 One sparse tensor holds what the camera sees, the hand's own points by its joints, and the goal's
 cloud, each kind in channels of its own. The goal's cloud is laid where the object is believed to
-be, so what is wrong with the belief shows as a small shift between two surfaces, wherever the
-object is. The network predicts by how much the belief is to be turned and shifted, and acts on the
-better one. A GRU carries over steps what one look does not show.
+be, so what is wrong with the belief shows as a shift between two surfaces, wherever the object is.
+The network predicts for each voxel of the goal by how much it is to move, and how sure that is; the
+rigid motion that fits these shifts best makes the belief better, and the network acts on that. A
+GRU carries over steps what one look does not show.
 
 The voxels of a step depend on the belief that the step before left. So a sequence can only be
 encoded at once if its beliefs are those of the rollout: training stores them beside the rest of a
-:class:`StudentInput`, as data through which no gradient flows, and teaches the residual from each stored
-belief to the truth.
+:class:`StudentInput`, as data through which no gradient flows, and teaches the shifts from each
+stored belief to the truth.
 
-N environments, T steps, D joints and actions, E the embedding, G the memory. Base frame of the
-hand; metres, radians.
+N environments, T steps, R looks, V voxels of goals in all of them, D joints and actions, E the
+embedding, G the memory. Base frame of the hand; metres, radians.
 """
 
 from collections.abc import Callable
@@ -42,8 +43,14 @@ LOG_STD = (-4.0, 0.0)
 """Least and largest logarithm of an action's standard deviation, as wide as teachers' are."""
 UNSURE = 2.2
 """Bias of the deviation at first: near the largest, or the gradient were the first actions' alone."""
-UNTURNED = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-"""The identity as two columns: what a network that predicts zeros turns by."""
+BELIEVED = 9
+"""Numbers of a belief: two columns of a rotation, and a place."""
+SHIFT_M = 0.01
+"""Unit of the deviation of shifts [m]."""
+LOG_SCALE = (-3.0, 3.0)
+"""Least and largest logarithm of that deviation: from 0.5 mm to 20 cm."""
+LEAST_M = 1e-4
+"""Goals are as if they were this wide at least [m], for what cannot be told."""
 
 Step = TypeVar("Step", "StudentInput", "StudentOutput", "Belief", Senses)
 
@@ -77,6 +84,36 @@ class StudentInput:
 
 
 @dataclass(frozen=True)
+class Flow:
+    """By how much the goal's voxels are to move to lie on the object, predicted."""
+
+    start: Tensor
+    """Where they are laid, from the believed place [m] [V, 3]."""
+    shift: Tensor
+    """By how much they are to move [m] [V, 3]."""
+    log_scale: Tensor
+    """Logarithm of the deviation of that, of a Laplace distribution [cm] [V]."""
+    look: Tensor
+    """The look to which each belongs, int64 [V]."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What R looks show, without memory."""
+
+    embedding: Tensor
+    """For the memory [R, E]."""
+    belief: Belief
+    """The better belief [R]."""
+    doubt: Tensor
+    """Mean of the logarithm of the deviation of shifts [cm] [R]."""
+    voxels: Tensor
+    """How many voxels hold points of the camera and none of the hand [R]."""
+    flow: Flow
+    """What the belief is made better by."""
+
+
+@dataclass(frozen=True)
 class StudentOutput:
     """What a student says of a step; leading axes [N] or [T, N], the memory's [N]."""
 
@@ -92,21 +129,57 @@ class StudentOutput:
     """How many voxels hold points of the camera and none of the hand [..]."""
     hidden: Tensor
     """Memory after the last step [N, G]."""
+    flow: Flow
+    """The shifts of all steps."""
 
 
 def each(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
-    """A step with every tensor changed, such as indexed."""
+    """A step with every tensor changed, such as indexed; a flow stays."""
     values: dict[str, Any] = {}
     for field in fields(step):
         value = getattr(step, field.name)
-        nested = isinstance(value, Belief)
-        values[field.name] = each(value, change) if nested else change(value)
+        if isinstance(value, Belief):
+            value = each(value, change)
+        elif not isinstance(value, Flow):  # which has no rows of steps
+            value = change(value)
+        values[field.name] = value
     return type(step)(**values)
 
 
 def carried(points: Tensor, rotation: Tensor, position: Tensor | float = 0.0) -> Tensor:
     """Points [.., P, 3] turned by matrices [.., 3, 3] and shifted by [.., 1, 3]: P R^T + p."""
     return points @ rotation.mT + position
+
+
+@torch.no_grad()
+def rigid_motion(flow: Flow, looks: int) -> tuple[Tensor, Tensor]:
+    """The rigid motion of each look that fits its shifts best, by weighted least squares (Kabsch 1976).
+
+    Voxels weigh by the inverse square of their deviation. About a line on which all of them lie
+    nothing is turned. No gradient flows.
+
+    Returns:
+        Rotations [R, 3, 3], and translations [m] [R, 3]: q ~ R p + t.
+    """
+
+    def total(values: Tensor) -> Tensor:
+        shape = looks, *values.shape[1:]
+        return values.new_zeros(shape).index_add(0, flow.look, values)
+
+    weight = torch.exp(-2.0 * flow.log_scale)
+    weight = weight / total(weight)[flow.look]
+    end = flow.start + flow.shift
+    from_middle = total(weight[:, None] * flow.start)
+    to_middle = total(weight[:, None] * end)
+    start = flow.start - from_middle[flow.look]
+    end = end - to_middle[flow.look]
+    covariance = total(weight[:, None, None] * end[:, :, None] * start[:, None, :])
+    still = LEAST_M**2 * torch.eye(3, device=covariance.device)
+    left, _, right = torch.linalg.svd(covariance + still)
+    signs = torch.ones_like(to_middle)
+    signs[:, 2] = torch.linalg.det(left @ right).sign()
+    rotation = left @ (signs[:, :, None] * right)
+    return rotation, to_middle - carried(from_middle[:, None], rotation)[:, 0]
 
 
 class InputBuilder:
@@ -251,52 +324,95 @@ class Student(nn.Module):
             nn.Linear(2 * widths[-1], cfg.embedding),
             nn.ReLU(),
         )
-        believed = len(UNTURNED) + 3
+        self.flow = nn.Sequential(
+            nn.Linear(sum(widths[1:]) + 2 * widths[-1] + 6, cfg.flow),
+            nn.GELU(),
+            nn.Linear(cfg.flow, cfg.flow),
+            nn.GELU(),
+            nn.Linear(cfg.flow, 4),
+        )
         self.senses = nn.Sequential(
-            nn.Linear(3 * num_actions + believed, cfg.senses),
+            nn.Linear(3 * num_actions + BELIEVED + 1, cfg.senses),
             nn.GELU(),
             nn.Linear(cfg.senses, cfg.senses),
         )
         self.memory = nn.GRU(cfg.embedding + cfg.senses, cfg.memory)
-        self.residual = nn.Linear(cfg.memory, believed)
         self.head = nn.Sequential(
-            nn.Linear(cfg.memory + believed, cfg.head),
+            nn.Linear(cfg.memory + BELIEVED, cfg.head),
             nn.GELU(),
         )
         self.mean = nn.Linear(cfg.head, num_actions)
         self.log_std = nn.Linear(cfg.head, num_actions)
         nn.init.constant_(self.log_std.bias, UNSURE)
         self.log_distance = nn.Linear(cfg.head, 1)
-        self.register_buffer("unturned", torch.tensor(UNTURNED), persistent=False)
 
     def first_hidden(self, envs: int) -> Tensor:
         """The memory where an episode begins: zeros [N, G]."""
         return self.mean.weight.new_zeros((envs, self.cfg.memory))
 
-    def encode(self, sight: StudentInput) -> tuple[Tensor, Tensor]:
-        """What one look shows [.., E], and voxels of the camera's points beside the hand's [..].
-
-        Waits for the device.
-        """
-        lead = sight.camera.shape[:-2]
-        place = sight.belief.position[..., None, :]
-        laid = carried(sight.goal, sight.belief.rotation)
+    def look(self, sight: StudentInput) -> Look:
+        """What R looks show, and a better belief. Waits for the device."""
+        believed = sight.belief
+        place = believed.position[:, None]
+        laid = carried(sight.goal, believed.rotation)
         kinds = [sight.camera - place, sight.hand - place, laid]
-        within = [self._within_reach(kind).flatten(0, -3) for kind in kinds]
+        within = [self._within_reach(kind) for kind in kinds]
         voxels = voxelise(within, self.cfg.voxel_m)
-        cells = voxels.sites.coordinates[:, 1:]
-        middles = self.cfg.voxel_m / PLACE_M * (cells + 0.5)
-        features = torch.cat([voxels.features, middles], dim=1)
-        features = features.to(next(self.stages.parameters()).dtype)
-        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
-            coarse = self.stages(SparseTensor(features, voxels.sites))
-        pooled = global_pool(coarse).to(place.dtype)
+        levels = self._convolve(voxels)
+        pooled = global_pool(levels[-1]).to(place.dtype)
+        flow = self._flow(voxels, levels, pooled)
+        looks = len(place)
+        turn, shift = rigid_motion(flow, looks)
         camera = voxels.features[:, 0]
         hand = voxels.features[:, 4]
         beside = camera * (1.0 - hand)
-        count = torch.segment_reduce(beside, "sum", lengths=voxels.sites.lengths, unsafe=True)
-        look = self.project(pooled).unflatten(0, lead)
-        return look, count.unflatten(0, lead)
+        lengths = voxels.sites.lengths
+        seen = torch.segment_reduce(beside, "sum", lengths=lengths, unsafe=True)
+        turned = turn @ believed.rotation
+        rotation = matrices(first_columns(turned))  # still a rotation after many steps
+        position = believed.position + shift
+        blind = (seen == 0.0)[:, None]
+        better = Belief(
+            rotation=torch.where(blind[..., None], believed.rotation, rotation),
+            position=torch.where(blind, believed.position, position),
+        )
+        count = torch.bincount(flow.look, minlength=looks)
+        summed = count.new_zeros(looks, dtype=place.dtype).index_add(0, flow.look, flow.log_scale)
+        return Look(self.project(pooled), better, summed / count, seen, flow)
+
+    def _convolve(self, voxels: SparseTensor) -> list[SparseTensor]:
+        """Features of the cells of each stage."""
+        cells = voxels.sites.coordinates[:, 1:]
+        middles = self.cfg.voxel_m / PLACE_M * (cells + 0.5)
+        features = torch.cat([voxels.features, middles], dim=1)
+        x = SparseTensor(features.to(next(self.stages.parameters()).dtype), voxels.sites)
+        levels = []
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
+            for stage in self.stages:
+                x = stage(x)
+                levels.append(x)
+        return levels
+
+    def _flow(self, voxels: SparseTensor, levels: list[SparseTensor], pooled: Tensor) -> Flow:
+        """The shifts of the goal's voxels, from the cells of all stages that hold them."""
+        sites = voxels.sites
+        goal = voxels.features[:, 8] > 0.0
+        keys = sites.keys[goal]
+        look = sites.coordinates[goal, 0].long()
+        offset = voxels.features[goal, 9:12]
+        start = self.cfg.voxel_m * (sites.coordinates[goal, 1:] + 0.5 + offset)
+        columns = [start / PLACE_M, offset, pooled[look]]
+        for level in levels:
+            cell = keys & ~(level.sites.step**3 - 1)
+            row = torch.searchsorted(level.sites.keys, cell)
+            columns.append(level.features[row].to(start.dtype))
+        predicted = self.flow(torch.cat(columns, dim=1))
+        return Flow(
+            start=start,
+            shift=PLACE_M * predicted[:, :3],
+            log_scale=predicted[:, 3].clamp(*LOG_SCALE),
+            look=look,
+        )
 
     def forward(
         self, sight: StudentInput, hidden: Tensor, done: Tensor | None = None
@@ -308,19 +424,18 @@ class Student(nn.Module):
             hidden: Memory before the first step [N, G].
             done: Where step t was the last of an episode, bool [T, N]: t + 1 begins without memory.
         """
-        belief = sight.belief
-        believed = self._believed(belief, sight.goal_rotation)
-        sensed = self.senses(torch.cat([sight.proprioception, believed], dim=-1))
-        look, voxels = self.encode(sight)
-        inputs = torch.cat([look, sensed], dim=-1)
-        remembered, hidden = self._remember(inputs, hidden, done)
-        turn, shift = self.residual(remembered).split([len(UNTURNED), 3], dim=-1)
-        turned = matrices(self.unturned + turn) @ belief.rotation
-        better = Belief(
-            rotation=matrices(first_columns(turned)),  # still a rotation after many steps
-            position=belief.position + PLACE_M * shift,
-        )
+        flat = self.look(each(sight, lambda value: value.flatten(0, 1)))
+        lead = sight.camera.shape[:2]
+
+        def of_steps(value: Tensor) -> Tensor:
+            return value.unflatten(0, lead)
+
+        better = each(flat.belief, of_steps)
         believed = self._believed(better, sight.goal_rotation)
+        doubt = of_steps(flat.doubt.detach())[..., None]
+        sensed = self.senses(torch.cat([sight.proprioception, believed, doubt], dim=-1))
+        inputs = torch.cat([of_steps(flat.embedding), sensed], dim=-1)
+        remembered, hidden = self._remember(inputs, hidden, done)
         features = self.head(torch.cat([remembered, believed], dim=-1))
         low, high = LOG_STD
         mean = self.mean(features)
@@ -330,8 +445,9 @@ class Student(nn.Module):
             log_std=low + (high - low) * share,
             belief=better,
             log_distance=self.log_distance(features).squeeze(-1),
-            voxels=voxels,
+            voxels=of_steps(flat.voxels),
             hidden=hidden,
+            flow=flat.flow,
         )
 
     def act(self, sight: StudentInput, hidden: Tensor) -> StudentOutput:
