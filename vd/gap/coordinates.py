@@ -218,8 +218,9 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         unit, factors = STARTS[key]
         values = units[unit] * np.array(factors)
         inside = np.clip(values, parameter.lower, parameter.upper)
-        columns[key] = np.where(values > 0.0, inside, values).tolist()
-    starts = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values())]
+        columns[key] = np.where(values > 0.0, inside, values)
+    count = len(next(iter(columns.values())))
+    starts = [{key: float(values[i]) for key, values in columns.items()} for i in range(count)]
     if effect in SLOWING:
         # The baseline's speed limit took the effect's place: let go of it as well.
         starts += [{**start, "velocity_limit": FREE_SPEED * scales.speed} for start in starts]

@@ -1,6 +1,5 @@
 """Compare what the gap workflow says with what was hidden, and gather the figures to reach."""
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from vd.gap.bench.hidden_plant import CABLE, COGGING, TUNED, WARMING, Physics
 from vd.gap.bench.hide import Hiding
 from vd.gap.bench.sizes import sized_effect
-from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
+from vd.kernels.servo.effects import TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")
 MASS_SPREAD = 0.2
