@@ -3,7 +3,6 @@
 What an object's recorded motions tell of its contact.
 """
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,8 +35,6 @@ class Contact:
     """
     out: Path = Path("contact")
     """DIR: folder of the report and of the layer."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the report as JSON."""
 
     def run(self) -> int:
         """Identify, write, and print the verdict."""
@@ -64,9 +61,6 @@ class Contact:
         make_folder(self.out)
         write_contact_layer(layer, file, identified(found), str(self.recording))
         write_json(self.out / REPORT, report)
-        if self.json:
-            print(json.dumps(report, indent=1))
-            return 0
         print(
             f"{report['verdict']}: "
             f"{', '.join(e['name'] for e in report['effects']) or 'nothing named'}"
