@@ -125,10 +125,12 @@ def _common(recording: Recording) -> dict[str, float | str]:
 def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
     """How far joints may move: in the hand's range, or in that of the commands before."""
     commands = np.concatenate([trajectory.command for trajectory in recording.trajectories])
-    lower, upper = commands.min(axis=0), commands.max(axis=0)
+    lower = commands.min(axis=0)
+    upper = commands.max(axis=0)
     if hand is not None:
         index = [hand.joint_names.index(name) for name in recording.joints]
-        lower, upper = hand.lower[index], hand.upper[index]
+        lower = hand.lower[index]
+        upper = hand.upper[index]
     gains = [float(t.conditions.get("p_gain", 0.0)) for t in recording.trajectories]
     return JointRange(recording.joints, lower, upper, max(gains) or 1.0, (0.0, 0.0))
 

@@ -84,7 +84,10 @@ class Rollouts:
         """
         if not dt > 0.0:
             raise ValueError(f"dt is {dt}; give a positive time step in seconds")
-        self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
+        self.chain = chain
+        self.recording = recording
+        self.dt = dt
+        self.device = device
         self._finer: dict[float, Rollouts] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
@@ -114,7 +117,8 @@ class Rollouts:
 
     @cached_property
     def _samples(self) -> Samples:
-        trajectories, columns = self.recording.trajectories, self.chain.columns
+        trajectories = self.recording.trajectories
+        columns = self.chain.columns
         command = np.concatenate([t.command[:, columns] for t in trajectories])
         power = np.concatenate(
             [t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories]
@@ -134,7 +138,8 @@ class Rollouts:
         # In single precision a fraction just under 1 is 1: the next step, which must then be
         # counted.
         fraction = (steps - whole).astype(np.float32)
-        whole, fraction = whole + (fraction >= 1.0), np.where(fraction < 1.0, fraction, 0.0)
+        whole = whole + (fraction >= 1.0)
+        fraction = np.where(fraction < 1.0, fraction, 0.0)
         return (
             wp.array(whole, dtype=int, device=self.device),
             wp.array(fraction, dtype=float, device=self.device),
@@ -193,10 +198,12 @@ class Rollouts:
             np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
         )
         counts = self._count[chosen]
-        length, width = int(counts.sum()), n if joint is None else 1
+        length = int(counts.sum())
+        width = n if joint is None else 1
         kept = np.ones((len(rows), len(counts)), bool) if keep is None else keep
         index, place = np.nonzero(kept)
-        trajectory, parameters = chosen[place], rows[index]
+        trajectory = chosen[place]
+        parameters = rows[index]
         self._scale_loads(parameters, trajectory)
         output = index * length + (np.cumsum(counts) - counts)[place]
         wanted = np.full(len(index), -1 if joint is None else joint)

@@ -338,7 +338,8 @@ def shown(
     half the interval of its logarithm is less than 1, to first order. Several sizes of one effect
     stand in for each other and say nothing one by one.
     """
-    limits, strengths = [], []
+    limits = []
+    strengths = []
     for parameter in EFFECTS[name].parameters:
         key = f"{name}.{parameter.name}"
         if parameter.column == servo.GRAVITY_PHASE or key not in values:
@@ -377,10 +378,12 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
     fitted = 1.0 - larger.rmse / smaller.rmse
     held_out = 1.0 - larger.held_out_rmse / smaller.held_out_rmse
     if white(evidence, larger):
-        gain, before = fitted, smaller.rmse
+        gain = fitted
+        before = smaller.rmse
         certain = held_out > 0.0
     else:
-        gain, before = min(fitted, held_out), smaller.held_out_rmse
+        gain = min(fitted, held_out)
+        before = smaller.held_out_rmse
         gained, error = paired(evidence, larger, smaller)
         certain = gained > error
     if gain < MIN_GAIN:

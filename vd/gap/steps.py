@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
 
 RUN = "run.json"
-FIND, EXPLAIN, CLOSE, CLOSING_CURVES = "find.json", "explain.json", "close.json", "closing.npz"
+FIND = "find.json"
+EXPLAIN = "explain.json"
+CLOSE = "close.json"
+CLOSING_CURVES = "closing.npz"
 CURVES = "predictions.npz"
 OUTPUTS = {
     "find": (FIND,),
@@ -80,7 +83,8 @@ class Analysis:
     """
 
     def __init__(self, settings: Settings, out: Path):
-        self.settings, self.out = settings, Path(out)
+        self.settings = settings
+        self.out = Path(out)
 
     @cached_property
     def recording(self) -> Recording:
@@ -94,7 +98,8 @@ class Analysis:
         Raises:
             ValueError: A hand is named for a recording of a bare servo or pendulum.
         """
-        recording, named = self.recording, self.settings.hand
+        recording = self.recording
+        named = self.settings.hand
         if recording.model not in BARE_MODELS:
             return named or model_path(recording.path, recording.model)
         if named is not None:
@@ -111,10 +116,8 @@ class Analysis:
             return None
         from vd.assets_usd.hands import load_hand, root_name
 
-        hand, model = (
-            load_hand(self.hand_name, layer=self.settings.hand_layer),
-            self.recording.model,
-        )
+        hand = load_hand(self.hand_name, layer=self.settings.hand_layer)
+        model = self.recording.model
         model = root_name(model_path(self.recording.path, model))
         if model != hand.name:
             raise ValueError(
@@ -156,7 +159,8 @@ class Analysis:
             ValueError: A setting cannot be used, or a step before ``first`` has not run.
         """
         for index in range(STEPS.index(first), STEPS.index(last) + 1):
-            name, done = STEPS[index], self._done(STEPS[:index])
+            name = STEPS[index]
+            done = self._done(STEPS[:index])
             if name in self._seconds() and not fresh:
                 print(f"{name}: nothing has changed, kept", file=sys.stderr)
                 continue
@@ -201,10 +205,8 @@ class Analysis:
     def _made_from(self) -> str:
         """Digest of everything that the steps are made from."""
         settings = to_dict(replace(self.settings, recording=Path()))
-        digest, folder = (
-            hashlib.sha256(json.dumps([METHOD, settings]).encode()),
-            self.recording.path,
-        )
+        digest = hashlib.sha256(json.dumps([METHOD, settings]).encode())
+        folder = self.recording.path
         files = ["recording.json", *(trajectory.file for trajectory in self.recording.trajectories)]
         models = [
             Path(model) for model in (self.hand_name, self.settings.hand_layer) if model is not None
@@ -268,7 +270,8 @@ def _close(analysis: Analysis) -> None:
     from vd.gap.plan import discard_plan, plan, tied, write_plan
 
     report = analysis.explained()
-    recording, hand = analysis.recording, analysis.hand
+    recording = analysis.recording
+    hand = analysis.hand
     whole = write_identified(report, analysis.out, recording, hand, analysis.start)
     closing, delivered, curves = simulate_again(
         report,

@@ -74,7 +74,9 @@ def _follows(
     read_delay: float = 0.0,
 ) -> float:
     """Share of a joint's duty cycle that follows the error if command or reading is that late [s]."""
-    pairs, column, reference = [np.zeros((2, 0))], chain.columns[joint], chain.reference_p_gain
+    pairs = [np.zeros((2, 0))]
+    column = chain.columns[joint]
+    reference = chain.reference_p_gain
     for t in trajectories:
         if t.pwm is not None and _recorded(t.pwm, column):
             duty = t.pwm[:, column]

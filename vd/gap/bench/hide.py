@@ -356,7 +356,8 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Hidde
         raise ValueError(
             f"{hand.name}: some joints follow others, which the gap workflow does not model"
         )
-    finger, n = fingers.index(joints), len(joints)
+    finger = fingers.index(joints)
+    n = len(joints)
     index = hand.fingers[finger]
     near = _spread(rng, hiding.base_spread, (3, n))
     heavy = _spread(rng, hiding.mass_spread, (n,))

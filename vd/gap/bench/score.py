@@ -125,7 +125,8 @@ class Case:
 
     def hiding(self) -> Hiding:
         """The recording to make."""
-        index, battery = KINDS.index(self.kind), BATTERIES[self.battery]
+        index = KINDS.index(self.kind)
+        battery = BATTERIES[self.battery]
         return Hiding(
             model=self.model,
             effects={name: sized_effect(name, self.size, self.model) for name in self.effects},
@@ -216,6 +217,8 @@ def said(result: Mapping[str, Any]) -> str:
 
 
 Results = Sequence[Mapping[str, Any]]
+HEAD = ("| figure | goal | measured | cases | reached |", "|---|---|---|---|---|")
+"""Of the table of :class:`Figure`."""
 
 
 @dataclass(frozen=True)
@@ -250,14 +253,14 @@ class Figure:
 
     def row(self) -> str:
         """A row of a table."""
-        bounds = {">=": self.least, "<=": self.most}
-        goal = ", ".join(
-            f"{sign} {bound:.3g}" for sign, bound in bounds.items() if math.isfinite(bound)
-        )
-        answer = (
-            (f"{self.value:.3f}", "yes" if self.reached else "no") if self.values else ("-", "")
-        )
-        return f"| {self.what} | {goal} | {answer[0]} | {len(self.values)} | {answer[1]} |"
+        goals = []
+        for sign, bound in ((">=", self.least), ("<=", self.most)):
+            if math.isfinite(bound):
+                goals.append(f"{sign} {bound:.3g}")
+        value, reached = "-", ""
+        if self.values:
+            value, reached = f"{self.value:.3f}", "yes" if self.reached else "no"
+        return f"| {self.what} | {', '.join(goals)} | {value} | {len(self.values)} | {reached} |"
 
 
 def figures(results: Results) -> list[Figure]:
@@ -265,7 +268,9 @@ def figures(results: Results) -> list[Figure]:
     kinds: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in KINDS}
     for r in results:
         kinds[r["case"]["kind"]].append(r)
-    single, good, parameters = [], [], []
+    single = []
+    good = []
+    parameters = []
     for r in kinds["single"]:
         if "error" in r:
             single.append(r)
@@ -330,8 +335,7 @@ def _unknown_or_near(result: Mapping[str, Any]) -> bool:
 
 def markdown(results: Results) -> str:
     """The figures as tables: the goals first, then what came of every effect at each size."""
-    lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
-    lines += [figure.row() for figure in figures(results)]
+    lines = [*HEAD, *(figure.row() for figure in figures(results))]
     lines += [
         "",
         "| hidden | size | gap / floor | cases | named | answers |",
