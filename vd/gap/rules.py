@@ -359,14 +359,22 @@ def best_of(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
 
 
 def contains(larger: JointFit, smaller: JointFit) -> bool:
-    """Whether a model is another with something added, or with a more general effect for one."""
-    covered = {*larger.effects}
-    for name in larger.effects:
-        covered.update(CONTAINS.get(name, ()))
+    """Whether a model is another with something added, or with a more general effect for one.
+
+    Of two that can do the same, neither contains the other.
+    """
+    return covered(larger) > covered(smaller)
+
+
+def covered(fit: JointFit) -> set[str]:
+    """The effects of a model, and those that it can imitate."""
+    result = {*fit.effects}
+    for name in fit.effects:
+        result.update(CONTAINS.get(name, ()))
     for name, parts in TOGETHER.items():
-        if covered.issuperset(parts):
-            covered.add(name)
-    return larger.effects != smaller.effects and covered.issuperset(smaller.effects)
+        if result.issuperset(parts):
+            result.add(name)
+    return result
 
 
 def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
