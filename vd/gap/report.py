@@ -133,7 +133,7 @@ def _trajectory_row(row: TrajectoryError) -> Row:
 
 
 def _not_tried(report: Report) -> list[Row]:
-    rows = []
+    rows: list[Row] = []
     for joint, reasons in report.not_tried.items():
         rows += [(joint, plain(name), plain(reason)) for name, reason in reasons.items()]
     return rows
@@ -171,7 +171,7 @@ def _credit_row(report: Report, row: Credit) -> Row:
 
 
 def _parameters(effects: Iterable[NamedEffect], note: str = "") -> list[Row]:
-    rows = []
+    rows: list[Row] = []
     for effect in effects:
         head = words.joints_text(effect.joints), plain(effect.name) + note
         confidence = "" if note else percent(effect.confidence)
@@ -182,7 +182,7 @@ def _parameters(effects: Iterable[NamedEffect], note: str = "") -> list[Row]:
 
 def _model(report: Report) -> list[Row]:
     """Parameters of the plain servo model of every joint, before and after."""
-    rows = []
+    rows: list[Row] = []
     for joint, after in report.identified.parameters.items():
         before = report.baseline.parameters[joint]
         for name, value in after.items():

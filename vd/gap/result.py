@@ -310,7 +310,7 @@ class Report:
     @property
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
         """The sets in ``ambiguous`` that another recording can split, without what their names stand for."""
-        sets = {}
+        sets: dict[frozenset[str], tuple[str, ...]] = {}
         for joint in self.joints:
             sets |= {frozenset(group): group for group in joint.open_sets}
         return tuple(sets.values())

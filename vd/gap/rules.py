@@ -171,14 +171,14 @@ class Evidence:
 
 def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
     """Effects that a joint of a chain can have besides its baseline."""
-    excluded = set()
+    allowed = {*effects}
     if "tau_g_nm" in chain.baseline_free:
-        excluded.add("gravity_load")
+        allowed.discard("gravity_load")
     if "inertia" in chain.baseline_free:
-        excluded.add("payload_inertia")
+        allowed.discard("payload_inertia")
     if len(chain.joints) == 1:
-        excluded.add("joint_coupling")
-    return [name for name in EFFECTS if name in effects and name not in excluded]
+        allowed.discard("joint_coupling")
+    return [name for name in EFFECTS if name in allowed]
 
 
 def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:
@@ -589,7 +589,7 @@ def families_of(
 
     Likely if those that have it predict more than half of the motions best, untold if not.
     """
-    tried = {name for fit in fits for name in fit.effects}
+    tried = set().union(*(fit.effects for fit in fits))
     result: dict[str, Certainty] = {}
     for name, family in FAMILIES.items():
         having = np.array([bool(family.effects.intersection(fit.effects)) for fit in good])
@@ -608,12 +608,17 @@ def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
     loose = []
     for fit in good:
         loose += [name for name in fit.effects if name not in common and name not in loose]
-    sets: list[list[str]] = []
+    sets: list[tuple[str, ...]] = []
     for name in loose:
-        rivals = [group for group in sets if any(apart(name, other, good) for other in group)]
-        merged = [other for group in rivals for other in group]
-        sets = [group for group in sets if group not in rivals] + [[*merged, name]]
-    return [tuple(group) for group in sets]
+        merged: tuple[str, ...] = ()
+        others = []
+        for group in sets:
+            if any(apart(name, other, good) for other in group):
+                merged += group
+            else:
+                others.append(group)
+        sets = [*others, (*merged, name)]
+    return sets
 
 
 def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
@@ -623,4 +628,4 @@ def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:
     """The verdict on a recording: the first, in the order of importance, that some joint has."""
-    return next((verdict for verdict in get_args(Verdict) if verdict in verdicts), "no_gap")
+    return min(verdicts, key=get_args(Verdict).index, default="no_gap")

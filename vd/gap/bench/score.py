@@ -158,8 +158,8 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
             right |= {name, *others}
             found |= hidden
     # So is one that stands for a hidden effect.
-    for name, others in equivalent(case.model).items():
-        meant = hidden.intersection(others)
+    for name, same in equivalent(case.model).items():
+        meant = hidden.intersection(same)
         if any(meant.intersection(group) for group in sets):
             right.add(name)
         if name in right.intersection(named):
