@@ -115,12 +115,12 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
         raise ValueError(
             f"{recording.path}: a recording of {recording.model!r} needs its hand; pass it"
         )
-    unknown = [name for name in recording.joints if name not in hand.joint_names]
-    if unknown:
-        raise ValueError(
-            f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
-            f"({', '.join(hand.joint_names)}); name the hand that was recorded"
-        )
+    for name in recording.joints:
+        if name not in hand.joint_names:
+            raise ValueError(
+                f"{recording.path}: {name} is no joint of {hand.name} "
+                f"({', '.join(hand.joint_names)}); name the hand that was recorded"
+            )
     if (hand.mimic >= 0).any():
         raise ValueError(
             f"{hand.name}: some joints follow others, which the gap workflow does not model"

@@ -141,8 +141,13 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
     def equations(
         kind: Kind, rows: Callable[[ContactMotion, _State], Iterator[Equations]]
     ) -> list[Equations]:
-        each = [list(rows(motion, state)) for motion in recording.motions if motion.kind == kind]
-        return [(sum(g for g, _ in own), sum(s for _, s in own)) for own in each if own]  # type: ignore[misc]
+        result = []
+        for motion in recording.motions:
+            own = list(rows(motion, state)) if motion.kind == kind else []
+            if own:
+                grams, slopes = zip(*own, strict=True)
+                result.append((np.sum(grams, axis=0), np.sum(slopes, axis=0)))
+        return result
 
     found = {}
     found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
@@ -172,9 +177,8 @@ def verdict(found: Sequence[ContactEstimate]) -> Literal["effects", "no_gap", "u
 
 def by_weight(found: Sequence[ContactEstimate]) -> list[ContactEstimate]:
     """The effects, those that stand out most from their intervals first."""
-    return sorted(
-        (each for each in found if each.verdict == "effect"), key=lambda each: -each.weight
-    )
+    effects = [each for each in found if each.verdict == "effect"]
+    return sorted(effects, key=lambda each: -each.weight)
 
 
 def _judge(
@@ -258,11 +262,11 @@ def _velocity(motion: ContactMotion) -> np.ndarray:
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1] + step, step)
     window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
-    smooth = (
-        savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step)
-        for v in motion.position.T[:2]
-    )
-    return np.stack([np.interp(time, even, v) for v in smooth], axis=1)
+    columns = []
+    for values in motion.position.T[:2]:
+        smooth = savgol_filter(np.interp(even, time, values), window, 2, deriv=1, delta=step)
+        columns.append(np.interp(time, even, smooth))
+    return np.stack(columns, axis=1)
 
 
 def _stretches(mask: np.ndarray) -> Iterator[slice]:

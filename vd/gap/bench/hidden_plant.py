@@ -188,13 +188,10 @@ class _Batch:
 
     def of(self, effect: str, parameter: str) -> np.ndarray:
         """A parameter of an effect for every run and joint [B, J]; 0 where the effect is absent."""
-        zero = np.zeros(self.count)
-        return np.stack(
-            [
-                np.broadcast_to(p.effects.get(effect, {}).get(parameter, zero), zero.shape)
-                for p in self.plants
-            ]
-        )
+        values = np.zeros((len(self.plants), self.count))
+        for row, plant in zip(values, self.plants, strict=True):
+            row[:] = plant.effects.get(effect, {}).get(parameter, 0.0)
+        return values
 
     def _finger(self) -> Finger | None:
         loads = [float(run.conditions.get("payload_kg", 0.0)) for run in self.runs]
@@ -479,10 +476,10 @@ class _Loads:
         self.session = np.array([[run.session_s] for run in batch.runs])
         self.loads = self.load.any()
         self.turn = self.rate = self.strain = np.zeros_like(self.weight)
-        self.presliding, self.gear, self.teeth = (
-            np.array([[getattr(p.physics, name)] for p in batch.plants]) + self.strain
-            for name in ("presliding_rad", "ripple_nm", "ripple_per_turn")
-        )
+        physics = [plant.physics for plant in batch.plants]
+        self.presliding = np.array([[each.presliding_rad] for each in physics]) + self.strain
+        self.gear = np.array([[each.ripple_nm] for each in physics])
+        self.teeth = np.array([[each.ripple_per_turn] for each in physics])
 
     def bend(self, v: np.ndarray) -> None:
         """Bend what carries dry friction by a step at speeds [B, J]."""

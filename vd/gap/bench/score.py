@@ -1,7 +1,6 @@
 """Compare what the gap workflow says with what was hidden, and gather the figures to reach."""
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -334,25 +333,5 @@ def _unknown_or_near(result: Mapping[str, Any]) -> bool:
 
 
 def markdown(results: Results) -> str:
-    """The figures as tables: the goals first, then what came of every effect at each size."""
-    lines = [*HEAD, *(figure.row() for figure in figures(results))]
-    lines += [
-        "",
-        "| hidden | size | gap / floor | cases | named | answers |",
-        "|---|---|---|---|---|---|",
-    ]
-    groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
-    for result in results:
-        case = result["case"]
-        if case["kind"] in ("single", "outside"):
-            groups.setdefault((case["effects"][0], case["size"]), []).append(result)
-    for (name, size), group in sorted(groups.items()):
-        good = [r for r in group if "error" not in r]
-        answers = Counter(said(r) if r["named"] or r["sets"] else r["verdict"] for r in good)
-        if failed := len(group) - len(good):
-            answers["failed"] = failed
-        told = "; ".join(f"{count} x {answer}" for answer, count in answers.items())
-        gap = f"{np.median([r['gap'] or 0.0 for r in good]):.1f}" if good else "-"
-        named = sum(name in r["found"] for r in good)
-        lines.append(f"| `{name}` | {size} | {gap} | {len(group)} | {named} | {told} |")
-    return "\n".join(lines) + "\n"
+    """The figures as a table."""
+    return "\n".join([*HEAD, *(figure.row() for figure in figures(results)), ""])
