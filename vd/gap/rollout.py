@@ -22,28 +22,16 @@ kd).
 """
 
 
-def links_of(
-    axis: np.ndarray,
-    offset: np.ndarray,
-    mass: np.ndarray,
-    com: np.ndarray,
-    inertia: np.ndarray,
-    gravity: np.ndarray,
-) -> Any:
-    """The bodies of a chain [n, ..] as kernels take them."""
-    size = room_for(len(mass))
+def links_of(chain: Any) -> Any:
+    """The bodies of a :class:`Chain`, or of what has the same arrays, as kernels take them."""
+    size = room_for(len(chain.mass))
     links = links_of_size(size)()
-    for name, values in (
-        ("axis", axis),
-        ("offset", offset),
-        ("mass", mass),
-        ("com", com),
-        ("inertia", inertia),
-    ):
+    for name in ("axis", "offset", "mass", "com", "inertia"):
+        values = getattr(chain, name)
         rows = np.zeros((size, *values.shape[1:]))
         rows[: len(values)] = values
         setattr(links, name, type(getattr(links, name))(*rows.ravel().tolist()))
-    links.gravity = wp.vec3(*np.asarray(gravity, float).tolist())
+    links.gravity = wp.vec3(*np.asarray(chain.gravity, float).tolist())
     return links
 
 
@@ -153,9 +141,7 @@ class Rollouts:
     def _links(self) -> tuple[Any, wp.array, wp.array, wp.array, wp.array]:
         """The links; slots; lower and upper stops; efforts."""
         chain = self.chain
-        links = links_of(
-            chain.axis, chain.offset, chain.mass, chain.com, chain.inertia, chain.gravity
-        )
+        links = links_of(chain)
         slot = wp.array(chain.slot, dtype=int, device=self.device)
         bounds = (chain.lower, chain.upper, chain.effort)
         lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
