@@ -48,10 +48,9 @@ CLEAR_M = 0.003
 SURE_S = 0.15
 """Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
 SLIDING = 0.1
+"""Share of the top speed down to which a slide counts: slower, noise decides the direction."""
 MOVING = 0.3
-"""Shares of the top speed down to which a slide, and a push, count: slower, noise decides the
-direction.
-"""
+"""The same of a push."""
 UPRIGHT_RAD = 0.05
 """Tilt within which a sliding object stays: more is tumbling or rolling."""
 TURNING = 0.3

@@ -33,9 +33,11 @@ the speed, a tip that stiffens, a table that is not level."""
 CONTACT_RATE = 800.0
 """Natural frequency of the table's contact [rad/s]: an impact lasts 4 ms."""
 TIP_KG = 0.01
+"""Mass of the pusher [kg]."""
 TIP_RADIUS_M = 0.008
+"""Radius of the pusher [m]."""
 TIP_DAMPING = 0.3
-"""Pusher: its mass, radius, and damping ratio on its spring."""
+"""Damping ratio of the pusher on its spring."""
 RIGID_N_M = 2.0e4
 """Stiffness of a pusher without compliance [N/m]: no real one is rigid."""
 CORNER_M = 2.0e-4
