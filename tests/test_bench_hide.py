@@ -80,14 +80,13 @@ def test_seeds_repeat_and_differ_alone_and_in_batches():
 def test_a_finger_is_recorded_by_name():
     motion = {"excitations": ("torque_release",)}
     hidden = simulate_hidden([
-        Hiding("dclaw3", {"coulomb_friction": {"tau_c_nm": 0.05}},
-               effect_joints={"coulomb_friction": ("f0_j2",)}, **motion),
+        Hiding("dclaw3", {"coulomb_friction": {"tau_c_nm": 0.05}}, **motion),
         Hiding("dclaw4", joints=("f1_j1", "f1_j2", "f1_j3"), **motion),
     ])  # fmt: skip
     first, second = (h.recording for h in hidden)
     assert first.joints == ("f0_j1", "f0_j2", "f0_j3") and second.joints[0] == "f1_j1"
     assert hidden[0].truth["effects"]["coulomb_friction"]["parameters"]["tau_c_nm"] == {
-        "f0_j1": 0.0, "f0_j2": 0.05, "f0_j3": 0.0}  # fmt: skip
+        "f0_j1": 0.05, "f0_j2": 0.05, "f0_j3": 0.05}  # fmt: skip
     falling = first.trajectories[1]
     assert falling.joints == ("f0_j2",) and not falling.enabled[-1, 1] and falling.enabled[-1, 0]
     assert falling.position[150, 1] - falling.position[-1, 1] > 0.02
@@ -103,10 +102,6 @@ def test_a_finger_is_recorded_by_name():
         ({"model": "servo", "effects": {"backlash": {"width_rad": np.nan}}}, "finite"),
         ({"model": "servo", "effects": {"backlash": {"width_rad": -0.04}}}, "negative"),
         ({"model": "servo", "effects": {"joint_coupling": {}}}, "one joint"),
-        (
-            {"model": "servo", "effects": {"backlash": {}}, "effect_joints": {"backlash": ("x",)}},
-            "'x'",
-        ),
         ({"model": "servo", "excitations": ("dance",)}, "dance"),
     ],
 )
@@ -116,11 +111,10 @@ def test_what_cannot_be_hidden_is_refused(options, words):
 
 
 def test_effects_are_read_from_the_command_line():
-    assert parse_effect("command_delay") == ("command_delay", {}, ())
-    assert parse_effect("stribeck_friction@f0_j2+f0_j3:tau_s_nm=0.2, v_s_rad_s=1e-1") == (
+    assert parse_effect("command_delay") == ("command_delay", {})
+    assert parse_effect("stribeck_friction:tau_s_nm=0.2, v_s_rad_s=1e-1") == (
         "stribeck_friction",
         {"tau_s_nm": 0.2, "v_s_rad_s": 0.1},
-        ("f0_j2", "f0_j3"),
     )
     for text in ("backlash:width_rad", "backlash:width_rad=wide"):
         with pytest.raises(ValueError, match="write width_rad=NUMBER"):

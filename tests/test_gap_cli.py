@@ -76,8 +76,6 @@ def test_run_writes_everything_and_says_what_was_found(fitted, recording, tmp_pa
     assert report.closing.identified_rmse_rad < 0.5 * report.closing.baseline_rmse_rad
     assert report.command.startswith(f"vd-gap run {recording}")
     assert {path.name for path in out.iterdir()} >= {"identified.usda", "report.html", "gap.png"}
-    assert cli.main(["run", str(recording), "--out", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads((out / "report.json").read_text())
 
 
 @pytest.fixture
@@ -137,13 +135,9 @@ def test_wrong_flags_are_named(recording, tmp_path, capsys, flags, message):
 
 def test_hide_writes_a_recording_and_the_truth(tmp_path, capsys):
     out = tmp_path / "rec"
-    assert (
-        cli.main(
-            ["hide", "servo", "--effect", "command_delay:delay_s=0.04", "--out", str(out), "--json"]
-        )
-        == 0
-    )
-    truth = json.loads(capsys.readouterr().out)
+    effect = "command_delay:delay_s=0.04"
+    assert cli.main(["hide", "servo", "--effect", effect, "--out", str(out)]) == 0
+    truth = json.loads((tmp_path / "rec.truth.json").read_text())
     assert truth["effects"]["command_delay"]["parameters"]["delay_s"] == {"joint": 0.04}
     assert len(read_recording(out).trajectories) == 8
     assert cli.main(["hide", "servo", "--effect", "stiction", "--out", str(out)]) == 1

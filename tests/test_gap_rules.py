@@ -14,6 +14,7 @@ from vd.gap.rules import (
     at_bound,
     changes,
     conclude,
+    contains,
     contradicted,
     difference,
     good_models,
@@ -117,6 +118,16 @@ def test_a_larger_model_is_good_only_if_none_that_it_contains_is(evidence: Evide
         assert good_models(evidence, [PLAIN, made_up(names, 0.0039), simple]) == [simple]
         larger = made_up(names, 0.0020)
         assert good_models(evidence, [PLAIN, larger, simple]) == [larger]
+
+
+def test_of_two_models_that_can_do_the_same_neither_has_to_earn_its_place_beside_the_other() -> (
+    None
+):
+    direction = made_up(("asymmetric_friction",), 0.004)
+    offset = made_up(("coulomb_friction", "encoder_bias"), 0.004)
+    both = made_up(("asymmetric_friction", "encoder_bias"), 0.004)
+    assert contains(offset, direction) and contains(both, direction)
+    assert not contains(offset, both) and not contains(both, offset)
 
 
 def test_samples_tell_models_apart_once_one_leaves_noise(evidence: Evidence) -> None:

@@ -1,6 +1,7 @@
 """Rollouts of chains against MuJoCo's C engine, a finer NumPy integration, and closed forms."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -68,7 +69,11 @@ def roll(
         np.full(n, stops),
         np.full(n, effort),
     ]
-    links = links_of_size(room_for(n))() if bodies is None else links_of(**bodies, gravity=GRAVITY)
+    links = (
+        links_of_size(room_for(n))()
+        if bodies is None
+        else links_of(SimpleNamespace(**bodies, gravity=GRAVITY))
+    )
     inputs += [int(bodies is not None), links]
     inputs += [np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS), dt]
     shapes = [(rolls, n, servo.STATE_COLUMNS), (rolls * count, n)]
@@ -147,7 +152,7 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
     bodies = random_bodies(rng, n)
     size = room_for(n)
     q, speed = rng.uniform(-3, 3, (5, size)), rng.uniform(-6, 6, (5, size))
-    inputs = [q, speed, links_of(**bodies, gravity=GRAVITY)]
+    inputs = [q, speed, links_of(SimpleNamespace(**bodies, gravity=GRAVITY))]
     mass, bias = launch(dynamics_kernel(size), 5, inputs, device, 5, 5)
     model, data = mujoco_chain(bodies, GRAVITY)
     for i in range(5):

@@ -118,8 +118,9 @@ def assemble(
             entries = effects if name in joint.conclusion.names else provisional
             entries.append(_effect(name, joint))
         families += _families(joint)
-        models += _models(joint, joint.conclusion.good[:LISTED])
-        compared += _models(joint, joint.fits)
+        every = _models(joint)
+        models += every[: min(LISTED, len(joint.conclusion.good))]
+        compared += every
         credits += _credits(joint)
         if joint.spec.aside is not None:
             aside[joint.name] = recording.trajectories[joint.spec.aside].file
@@ -305,35 +306,41 @@ def _sets(joints: Sequence[AnalysedJoint]) -> tuple[tuple[str, ...], ...]:
 def _families(joint: AnalysedJoint) -> list[FamilyVerdict]:
     """What is known of each family on a joint."""
     rows = []
-    good, shares = joint.conclusion.good, joint.conclusion.shares
+    good = joint.conclusion.good
+    shares = joint.conclusion.shares
     for name, verdict in joint.conclusion.families.items():
-        members: list[str] = []
+        members: dict[str, None] = {}
         share = 0.0
         for fit, weight in zip(good, shares, strict=True):
             inside = [effect for effect in fit.effects if effect in rules.FAMILIES[name].effects]
-            members += [effect for effect in inside if effect not in members]
-            share += float(weight) if inside else 0.0
+            members |= dict.fromkeys(inside)
+            share += float(weight) * bool(inside)
         rows.append(FamilyVerdict(joint.name, name, verdict, tuple(members), share))
     return rows
 
 
-def _models(joint: AnalysedJoint, fits: Sequence[JointFit]) -> list[WholeModel]:
-    """Rows of models of a joint, the best first; the delivered one with its final values."""
+def _models(joint: AnalysedJoint) -> list[WholeModel]:
+    """All models of a joint, the good ones and the best first; the delivered one as it is finished."""
     good = list(joint.conclusion.good)
     rows = []
-    for fit in sorted(fits, key=lambda fit: (fit not in good, fit.held_out_rmse)):
-        same = fit.effects == joint.final.effects
-        values = joint.final.values if same else fit.values
+    for fit in sorted(joint.fits, key=lambda fit: (fit not in good, fit.held_out_rmse)):
+        finished = joint.final if fit.effects == joint.final.effects else fit
+        share = 0.0
+        why = ""
+        if fit in good:
+            share = float(joint.conclusion.shares[good.index(fit)])
+        else:
+            why = rules.against(joint.evidence, joint.fits, good, fit)
         rows.append(
             WholeModel(
                 joint=joint.name,
                 effects=fit.effects,
-                parameters={key: value for key, value in values.items() if "." in key},
-                rmse_rad=joint.final.rmse if same else fit.rmse,
+                parameters={key: x for key, x in finished.values.items() if "." in key},
+                rmse_rad=finished.rmse,
                 held_out_rmse_rad=fit.held_out_rmse,
                 difference_ci95=rules.difference(joint.evidence, good[0], fit),
-                share=float(joint.conclusion.shares[good.index(fit)]) if fit in good else 0.0,
-                why="" if fit in good else rules.against(joint.evidence, fits, good, fit),
+                share=share,
+                why=why,
             )
         )
     return rows

@@ -91,7 +91,8 @@ class Chain:
 
     def inertia_scale(self, joint: int) -> float:
         """Inertia of the links about a joint with all joints at zero, without the drive's own [kg m^2]."""
-        axis, places = self.axis[joint], np.cumsum(self.offset, axis=0) + self.com
+        axis = self.axis[joint]
+        places = np.cumsum(self.offset, axis=0) + self.com
         levers = np.cross(axis, places - np.cumsum(self.offset, axis=0)[joint])[joint:]
         own = np.einsum("i,kij,j->k", axis, self.inertia[joint:], axis)
         return float(np.sum(self.mass[joint:] * (levers**2).sum(axis=1) + own))
@@ -114,12 +115,12 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
         raise ValueError(
             f"{recording.path}: a recording of {recording.model!r} needs its hand; pass it"
         )
-    unknown = [name for name in recording.joints if name not in hand.joint_names]
-    if unknown:
-        raise ValueError(
-            f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
-            f"({', '.join(hand.joint_names)}); name the hand that was recorded"
-        )
+    for name in recording.joints:
+        if name not in hand.joint_names:
+            raise ValueError(
+                f"{recording.path}: {name} is no joint of {hand.name} "
+                f"({', '.join(hand.joint_names)}); name the hand that was recorded"
+            )
     if (hand.mimic >= 0).any():
         raise ValueError(
             f"{hand.name}: some joints follow others, which the gap workflow does not model"
@@ -180,14 +181,20 @@ def _finger(
     What an unrecorded joint carries is fixed to its parent.
     """
     slots = [i for i, name in enumerate(hand.joint_names[finger]) if name in names]
-    joints, n = finger.start + np.array(slots), len(slots)
+    joints = finger.start + np.array(slots)
+    n = len(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
-    parents, frames = poses[hand.joint_parent[joints]], hand.joint_parent_frame[joints]
-    turns, own = Rotation.from_quat(parents[:, 3:]), Rotation.from_quat(poses[:, 3:])
+    parents = poses[hand.joint_parent[joints]]
+    frames = hand.joint_parent_frame[joints]
+    turns = Rotation.from_quat(parents[:, 3:])
+    own = Rotation.from_quat(poses[:, 3:])
     origins = parents[:, :3] + turns.apply(frames[:, :3])
-    centres, matrices = poses[:, :3] + own.apply(hand.link_com), own.as_matrix()
+    centres = poses[:, :3] + own.apply(hand.link_com)
+    matrices = own.as_matrix()
     turned = matrices @ hand.link_inertia @ matrices.transpose(0, 2, 1)
-    mass, com, inertia = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    mass = np.zeros(n)
+    com = np.zeros((n, 3))
+    inertia = np.zeros((n, 3, 3))
     for i, (first, end) in enumerate(pairwise([*joints, finger.stop])):
         links = hand.joint_child[first:end]
         masses = hand.link_mass[links]

@@ -1,6 +1,5 @@
 """vd-gap: where simulation and measurement disagree, which effect is missing, and how much it closes."""
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -44,8 +43,6 @@ class _Step:
     """cpu, cuda, or auto."""
     fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Repeat finished steps even if nothing has changed."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what the step wrote as JSON."""
 
     def analysis(self) -> "Analysis":
         """The analysis in DIR with these settings.
@@ -65,9 +62,9 @@ class _Step:
         return analysis
 
     def run(self) -> int:
-        """Run the steps, and print the verdict or what the last one wrote."""
+        """Run the steps, and print the verdict or the file that the last one wrote."""
         analysis = self.analysis()
-        if self.hand is None and not self.json:
+        if self.hand is None:
             words = () if analysis.hand_name is None else ("--hand", analysis.hand_name)
             say_same_as(
                 "vd-gap",
@@ -78,13 +75,10 @@ class _Step:
                 self.out,
             )
         analysis.run(self.last, first=self.first, fresh=self.fresh or self.first == "report")
-        path = analysis.out / f"{self.last}.json"
-        if self.json:
-            print(path.read_text())
-        elif self.last == "report":
+        if self.last == "report":
             _print_report(analysis)
         else:
-            print(path)
+            print(analysis.out / f"{self.last}.json")
         return 0
 
 
@@ -136,11 +130,7 @@ class PlanCommand(_Step):
         analysis = self.analysis()
         analysis.run("explain", fresh=self.fresh)
         result = plan(analysis.explained(), analysis.recording, analysis.hand)
-        path = write_plan(result, self.out)
-        if self.json:
-            print(path.read_text())
-        else:
-            print(f"{result.sentence}\n{path}")
+        print(f"{result.sentence}\n{write_plan(result, self.out)}")
         return 0
 
 
@@ -158,38 +148,24 @@ class HideCommand:
     out: Path
     """Folder of the recording to write."""
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME, NAME:PARAMETER=VALUE,... or NAME@JOINT+JOINT:...; give it again for a second effect, or
-    leave it out to hide nothing."""
+    """NAME or NAME:PARAMETER=VALUE,...; give it again for a second effect, or leave it out to hide
+    nothing."""
     excitations: tuple[str, ...] = ("steps_and_sines",)
     """Sets of motions."""
     seed: int = 0
     """Seed of everything random."""
     pwm: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Record the duty cycle as well, which tells a late command from a late reading."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the truth as JSON."""
 
     def run(self) -> int:
         """Write the recording."""
         from vd.gap.bench.hide import Hiding, check_hidden, hide, parse_effect, truth_path
 
         check_hidden(self.out)
-        parsed = [parse_effect(text) for text in self.effect]
-        hiding = Hiding(
-            self.model,
-            {name: values for name, values, _ in parsed},
-            self.seed,
-            effect_joints={name: joints for name, _, joints in parsed if joints},
-            excitations=self.excitations,
-            pwm=self.pwm,
-        )
-        hidden = hide(hiding, self.out)
-        if self.json:
-            print(json.dumps(hidden.truth, indent=1))
-        else:
-            print(
-                f"{self.out}: {len(hidden.recording.trajectories)} motions\n{truth_path(self.out)}"
-            )
+        effects = dict(map(parse_effect, self.effect))
+        hiding = Hiding(self.model, effects, self.seed, excitations=self.excitations, pwm=self.pwm)
+        count = len(hide(hiding, self.out).recording.trajectories)
+        print(f"{self.out}: {count} motions\n{truth_path(self.out)}")
         return 0
 
 

@@ -56,7 +56,8 @@ def write_identified(
     """
     from vd.assets_usd.hand_layer import write_layer
 
-    fitted, held = report.identified.parameters, (*report.effects, *report.provisional)
+    fitted = report.identified.parameters
+    held = (*report.effects, *report.provisional)
     (folder / WHOLE_HAND_LAYER).unlink(missing_ok=True)
     others = {} if hand is None else counterparts(hand, tuple(fitted))
     source = {joint: joint for joint in fitted}
@@ -187,7 +188,8 @@ def _newton(
     from vd.gap.rollout import STEP_S
     from vd.sim.replay import simulate_hand
 
-    before, after = load_hand(hand_name, layer=start_layer), load_hand(hand_name, layer=layer)
+    before = load_hand(hand_name, layer=start_layer)
+    after = load_hand(hand_name, layer=layer)
     rows = np.array([before.servo, after.servo], dtype=float)
     for joint, values in report.baseline.parameters.items():
         for parameter in (*BASELINE, GRAVITY):

@@ -47,10 +47,10 @@ CLEAR_M = 0.003
 """
 SURE_S = 0.15
 """Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
-SLIDING, MOVING = 0.1, 0.3
-"""Shares of the top speed down to which a slide, and a push, count: slower, noise decides the
-direction.
-"""
+SLIDING = 0.1
+"""Share of the top speed down to which a slide counts: slower, noise decides the direction."""
+MOVING = 0.3
+"""The same of a push."""
 UPRIGHT_RAD = 0.05
 """Tilt within which a sliding object stays: more is tumbling or rolling."""
 TURNING = 0.3
@@ -140,8 +140,13 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
     def equations(
         kind: Kind, rows: Callable[[ContactMotion, _State], Iterator[Equations]]
     ) -> list[Equations]:
-        each = [list(rows(motion, state)) for motion in recording.motions if motion.kind == kind]
-        return [(sum(g for g, _ in own), sum(s for _, s in own)) for own in each if own]  # type: ignore[misc]
+        result = []
+        for motion in recording.motions:
+            own = list(rows(motion, state)) if motion.kind == kind else []
+            if own:
+                grams, slopes = zip(*own, strict=True)
+                result.append((np.sum(grams, axis=0), np.sum(slopes, axis=0)))
+        return result
 
     found = {}
     found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
@@ -171,9 +176,8 @@ def verdict(found: Sequence[ContactEstimate]) -> Literal["effects", "no_gap", "u
 
 def by_weight(found: Sequence[ContactEstimate]) -> list[ContactEstimate]:
     """The effects, those that stand out most from their intervals first."""
-    return sorted(
-        (each for each in found if each.verdict == "effect"), key=lambda each: -each.weight
-    )
+    effects = [each for each in found if each.verdict == "effect"]
+    return sorted(effects, key=lambda each: -each.weight)
 
 
 def _judge(
@@ -187,22 +191,26 @@ def _judge(
     nominal = parameter.of(item)
     resolution = parameter.resolution * (nominal if parameter.relative else np.ones(len(nominal)))
     value, deviation = _estimate(motions, len(nominal))
-    deviation, freedom = np.hypot(deviation, besides), max(len(motions) - 1, 1)
+    deviation = np.hypot(deviation, besides)
+    freedom = max(len(motions) - 1, 1)
     # All numbers of all parameters together may give a false name in FALSE_NAMES of recordings.
     numbers = sum(len(p.nominal) for p in CONTACT.values())
     half = student.ppf(1.0 - 0.5 * FALSE_NAMES / numbers, freedom) * deviation
-    gap, least = np.abs(value - nominal), np.maximum(half, resolution)
+    gap = np.abs(value - nominal)
+    least = np.maximum(half, resolution)
     told = bool(np.isfinite(deviation).all())
     weight = float((gap / least).max()) if told else 0.0
     says: Literal["effect", "no_gap", "unknown"] = "unknown"
     if not told:
         reason = f"no motion tells it; {parameter.record}"
     elif weight > 1.0:
-        says, reason = "effect", "the interval excludes what the object's file says"
+        says = "effect"
+        reason = "the interval excludes what the object's file says"
     elif (half > resolution).any():
         reason = f"the interval is too wide to say; {parameter.record}"
     else:
-        says, reason = "no_gap", "as the object's file says, as far as can be told"
+        says = "no_gap"
+        reason = "as the object's file says, as far as can be told"
     confidence = float(1.0 - 2.0 * student.sf((gap / deviation).max(), freedom)) if told else 0.0
     usual = student.ppf(0.975, freedom) * deviation
     ends = value - usual, value + usual
@@ -216,7 +224,8 @@ def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarr
 
     NaN if not determined.
     """
-    count, blank = len(motions), np.full(size, np.nan)
+    count = len(motions)
+    blank = np.full(size, np.nan)
     if count < 3:
         return blank, blank
     gram, slope = (np.array(arrays) for arrays in zip(*motions, strict=True))
@@ -252,11 +261,11 @@ def _velocity(motion: ContactMotion) -> np.ndarray:
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1] + step, step)
     window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
-    smooth = (
-        savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step)
-        for v in motion.position.T[:2]
-    )
-    return np.stack([np.interp(time, even, v) for v in smooth], axis=1)
+    columns = []
+    for values in motion.position.T[:2]:
+        smooth = savgol_filter(np.interp(even, time, values), window, 2, deriv=1, delta=step)
+        columns.append(np.interp(time, even, smooth))
+    return np.stack(columns, axis=1)
 
 
 def _stretches(mask: np.ndarray) -> Iterator[slice]:
@@ -278,7 +287,8 @@ def _released(motion: ContactMotion, part: slice) -> slice:
 
     As long before the impact as the motion is free flight.
     """
-    time, end = motion.time, part.stop
+    time = motion.time
+    end = part.stop
     first = min(max(int(np.searchsorted(time, time[end - 1] - SURE_S)), part.start), end - FEWEST)
     usual = float(np.median(_flight_errors(motion, slice(first, end))))
     while first > part.start:
@@ -292,7 +302,8 @@ def _released(motion: ContactMotion, part: slice) -> slice:
 
 def _flight_errors(motion: ContactMotion, part: slice) -> np.ndarray:
     """Distances of a stretch from the best parabola of any centre of mass, [T] [m]."""
-    time, turn = motion.time[part] - motion.time[part].mean(), motion.rotation[part].as_matrix()
+    time = motion.time[part] - motion.time[part].mean()
+    turn = motion.rotation[part].as_matrix()
     design = np.zeros((3, len(time), 9))
     for axis in range(3):
         design[axis, :, 2 * axis : 2 * axis + 2] = np.vander(time, 2)
@@ -332,7 +343,8 @@ def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
 
 def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Path along the direction of a slide = s0 + v t - mu g t^2 / 2."""
-    time, velocity = motion.time, _velocity(motion)
+    time = motion.time
+    velocity = _velocity(motion)
     speed = np.linalg.norm(velocity, axis=1)
     free = (time > time[speed.argmax()] + SMOOTH_S) & (speed > SLIDING * speed.max())
     for part in _stretches(free & _flat_on_table(motion, state)):
@@ -384,7 +396,8 @@ def _touch(
         When [s]; how fast the points that touch it rise then [m/s]; which points they are, [N]
         bool.
     """
-    time, edge = motion.time[part], -1 if touching is None else 0
+    time = motion.time[part]
+    edge = -1 if touching is None else 0
     since = time - time[edge]
     centre = motion.position[part] + motion.rotation[part].apply(state.centre)
     height, rise = np.polynomial.polynomial.polyfit(
@@ -413,17 +426,16 @@ def _touch(
 def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
     velocity = _velocity(motion)
-    speed, pressing = (
-        np.linalg.norm(velocity, axis=1),
-        np.linalg.norm(motion.force, axis=1) > PRESSED_N,
-    )
+    speed = np.linalg.norm(velocity, axis=1)
+    pressing = np.linalg.norm(motion.force, axis=1) > PRESSED_N
     sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
     margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
     for whole in _stretches(sliding):
         part = slice(
             whole.start + margin, whole.stop - margin
         )  # velocities at the ends are of other motions too
-        time, ahead = motion.time[part], velocity[part] / speed[part, None]
+        time = motion.time[part]
+        ahead = velocity[part] / speed[part, None]
         if len(time) >= FEWEST:
             along = (motion.force[part, :2] * ahead).sum(1) + state.friction * motion.force[part, 2]
             gain = speed[part][-1] - speed[part][0] + state.friction * GRAVITY_M_S2 * np.ptp(time)
@@ -434,7 +446,8 @@ def _presses(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Way of the pusher into the object = c times the force."""
     size = np.linalg.norm(motion.force, axis=1)
     ahead = motion.force[size.argmax()] / size.max()
-    force, way = motion.force @ ahead, (motion.pusher - motion.position) @ ahead
+    force = motion.force @ ahead
+    way = (motion.pusher - motion.position) @ ahead
     touching = force > PRESSED_N
     if touching.sum() >= FEWEST:
         yield _equations(np.ones((touching.sum(), 1)), force[touching, None], way[touching])

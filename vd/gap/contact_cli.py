@@ -3,7 +3,6 @@
 What an object's recorded motions tell of its contact.
 """
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ if TYPE_CHECKING:
     from vd.gap.contact import ContactEstimate
 
 FORMAT = "vd-contact-report/1"
-REPORT, LAYER = "report.json", "identified.usda"
+REPORT = "report.json"
+LAYER = "identified.usda"
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,13 @@ class Contact:
     """
     out: Path = Path("contact")
     """DIR: folder of the report and of the layer."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the report as JSON."""
 
     def run(self) -> int:
         """Identify, write, and print the verdict."""
         from vd.logs.contact_recording import read_contact_recording
 
-        recording, began = read_contact_recording(self.recording), time.perf_counter()
+        recording = read_contact_recording(self.recording)
+        began = time.perf_counter()
         from vd.assets_usd.objects.model import read_object, write_contact_layer
         from vd.assets_usd.objects.sets import set_files
         from vd.command.files import make_folder, write_json
@@ -54,7 +53,8 @@ class Contact:
             raise ValueError(
                 f"--object {self.object} has {1 + len(others)} objects; name the one that moved"
             )
-        item, layer = read_object(file), self.out / LAYER
+        item = read_object(file)
+        layer = self.out / LAYER
         if layer.exists() and layer.samefile(file):
             raise ValueError(f"--out {self.out} holds --object itself; name another folder")
         found = identify_contact(recording, item)
@@ -64,9 +64,6 @@ class Contact:
         make_folder(self.out)
         write_contact_layer(layer, file, identified(found), str(self.recording))
         write_json(self.out / REPORT, report)
-        if self.json:
-            print(json.dumps(report, indent=1))
-            return 0
         print(
             f"{report['verdict']}: "
             f"{', '.join(e['name'] for e in report['effects']) or 'nothing named'}"
@@ -83,20 +80,15 @@ class Contact:
 
 def identified(found: "Sequence[ContactEstimate]") -> dict[str, tuple[tuple[float, ...], ...]]:
     """What is told, as :func:`vd.assets_usd.objects.contact_layer.write_contact_layer` takes it."""
-    return {
-        each.name: (
-            tuple(each.value.tolist()),
-            # A coarse interval may reach below zero, which cannot be simulated.
-            tuple(
-                each.low.tolist()
-                if len(each.low) > 1
-                else np.maximum(each.low, 0.1 * each.value).tolist()
-            ),
-            tuple(each.high.tolist()),
-        )
-        for each in found
-        if each.verdict != "unknown"
-    }
+    result = {}
+    for each in found:
+        if each.verdict == "unknown":
+            continue
+        low = each.low
+        if len(low) == 1:  # a coarse interval may reach below zero, which cannot be simulated
+            low = np.maximum(low, 0.1 * each.value)
+        result[each.name] = tuple(tuple(v.tolist()) for v in (each.value, low, each.high))
+    return result
 
 
 def contact_report(
@@ -109,31 +101,29 @@ def contact_report(
     def numbers(values: Any) -> list[float | None]:
         return [float(value) if value == value else None for value in values]
 
-    def estimate(each: "ContactEstimate") -> dict[str, Any]:
+    estimates = {}
+    parameters = {}
+    for each in found:
         interval = [numbers(each.low), numbers(each.high)]
-        return {"value": numbers(each.value), "ci95": interval, "unit": CONTACT[each.name].unit}
-
+        unit = CONTACT[each.name].unit
+        one = {"value": numbers(each.value), "ci95": interval, "unit": unit}
+        estimates[each.name] = one
+        parameters[each.name] = {
+            **one,
+            "verdict": each.verdict,
+            "nominal": numbers(each.nominal),
+            "motions": each.motions,
+            "reason": each.reason,
+        }
+    effects = []
+    for each in by_weight(found):
+        named = {each.name: estimates[each.name]}
+        effects.append({"name": each.name, "confidence": each.confidence, "parameters": named})
     return {
         "format": FORMAT,
         "verdict": verdict(found),
-        "effects": [
-            {
-                "name": each.name,
-                "confidence": each.confidence,
-                "parameters": {each.name: estimate(each)},
-            }
-            for each in by_weight(found)
-        ],
-        "parameters": {
-            each.name: {
-                **estimate(each),
-                "verdict": each.verdict,
-                "nominal": numbers(each.nominal),
-                "motions": each.motions,
-                "reason": each.reason,
-            }
-            for each in found
-        },
+        "effects": effects,
+        "parameters": parameters,
         "recording": recording,
         "object": item,
         "seconds": seconds,

@@ -76,9 +76,11 @@ def convert(asked: Convert) -> Recording:
         )
     if (asked.out / "recording.json").exists():
         raise ValueError(f"--out {asked.out} holds a recording; name another folder")
-    if bad := [pair for pair in asked.rename if "=" not in pair]:
-        raise ValueError(f"--rename {bad[0]!r} is no OLD=NEW")
-    rename = {old: new for old, _, new in (pair.partition("=") for pair in asked.rename)}
+    rename = {}
+    for pair in asked.rename:
+        old, mark, rename[old] = pair.partition("=")
+        if not mark:
+            raise ValueError(f"--rename {pair!r} is no OLD=NEW")
     format = asked.format or format_of(asked.source)
     if format != "ros" and (topic := asked.state_topic or asked.command_topic):
         raise ValueError(
@@ -97,10 +99,11 @@ def convert(asked: Convert) -> Recording:
     trajectories = tuple(
         _trajectory(asked, one, joints, MIN_SAMPLES * resolution) for one in motions
     )
-    if there := [one.file for one in trajectories if (asked.out / one.file).exists()]:
-        raise ValueError(
-            f"--out {asked.out} holds {there[0]}, which would be lost; name another folder"
-        )
+    for one in trajectories:
+        if (asked.out / one.file).exists():
+            raise ValueError(
+                f"--out {asked.out} holds {one.file}, which would be lost; name another folder"
+            )
     model = asked.model or ("pendulum" if format == "bam" else "servo")
     with TemporaryDirectory() as work:
         write_recording(Recording(Path(work), model, joints, {}, resolution, trajectories), work)
@@ -117,16 +120,15 @@ def _trajectory(
 ) -> Trajectory:
     """A motion with the wanted joints in their order."""
     where = f"{asked.source}: {motion.name}"
-    if missing := [joint for joint in joints if joint not in motion.joints]:
-        raise RecordingError(
-            f"{where}: no joint {missing[0]!r}; there are {', '.join(motion.joints)}"
-        )
+    for joint in joints:
+        if joint not in motion.joints:
+            there = ", ".join(motion.joints)
+            raise RecordingError(f"{where}: no joint {joint!r}; there are {there}")
     picked = [motion.joints.index(joint) for joint in joints]
-    channels: dict[str, Any] = {
-        name: values[:, picked]
-        for name, values in motion.channels.items()
-        if name not in asked.drop and not np.isnan(values[:, picked]).all()
-    }
+    channels: dict[str, Any] = {}
+    for name, values in motion.channels.items():
+        if name not in asked.drop and not np.isnan(values[:, picked]).all():
+            channels[name] = values[:, picked]
     for name in REQUIRED:
         bad = joints if name not in channels else [joints[j] for j in _with_gaps(channels[name])]
         if len(bad):

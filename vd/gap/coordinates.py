@@ -37,6 +37,38 @@ FREE_SPEED = 3.0
 """A speed limit that does not bind, in largest speeds. Not tuned; without starts there the XL330
 keeps 45 mrad for 30 at one gain."""
 
+STARTS: dict[str, tuple[str, tuple[float, ...]]] = {
+    "command_delay.delay_s": ("period", (0.3, 1.0, 3.0, 6.0)),
+    "read_delay.delay_s": ("period", (0.3, 1.0, 3.0, 6.0)),
+    "command_filter.tau_s": ("period", (0.3, 1.0, 3.0, 10.0)),
+    "acceleration_limit.a_max_rad_s2": ("acceleration", (2.0, 1.0, 0.5, 0.25, 0.1)),
+    "torque_limit.tau_max_nm": ("peak", (0.9, 0.6, 0.35, 0.2)),
+    "torque_speed_limit.tau_stall_nm": ("peak", (1.0, 1.0, 0.5, 0.5, 0.25)),
+    "torque_speed_limit.omega_0_rad_s": ("speed", (1.1, 2.0, 1.2, 2.5, 1.5)),
+    "torque_saturation.tau_s_nm": ("peak", (1.5, 0.7, 0.35, 0.2)),
+    "supply_sag.relative": ("sag", (0.1, 0.4, 1.2, 4.0)),
+    "thermal_drift.rate_per_s": ("rate", (0.1, 0.5, 1.5)),
+    "coulomb_friction.tau_c_nm": ("torque", (0.03, 0.1, 0.3, 0.7)),
+    "stribeck_friction.tau_s_nm": ("torque", (0.1, 0.3, 0.3, 0.7)),
+    "stribeck_friction.tau_c_nm": ("torque", (0.02, 0.1, 0.05, 0.2)),
+    "stribeck_friction.v_s_rad_s": ("speed", (0.05, 0.05, 0.2, 0.05)),
+    "load_friction.k_load": ("one", (0.05, 0.15, 0.4)),
+    "asymmetric_friction.tau_plus_nm": ("torque", (0.1, 0.03, 0.4, 0.1)),
+    "asymmetric_friction.tau_minus_nm": ("torque", (0.03, 0.1, 0.1, 0.4)),
+    "backlash.width_rad": ("residual", (0.7, 2.0, 5.0)),
+    "dead_zone.width_rad": ("residual", (0.7, 2.0, 5.0)),
+    "integral_action.k_i": ("kp", (0.1, 0.5, 2.0, 8.0)),
+    "encoder_bias.bias_rad": ("residual", (0.5, -0.5, 1.5, -1.5)),
+    "gravity_load.tau_g_nm": ("torque", (0.1, 0.1, 0.1, 0.1, 0.5, 0.5, 0.5, 0.5)),
+    "gravity_load.phase_rad": ("one", (0.0, 1.57, -1.57, 3.1, 0.0, 1.57, -1.57, 3.1)),
+    "payload_inertia.j_kgm2": ("inertia", (0.1, 0.5, 2.0)),
+    "elastic_transmission.k_nm_rad": ("kp", (0.3, 0.3, 1.0, 1.0, 3.0, 3.0)),
+    "elastic_transmission.c_nms_rad": ("damping", (0.03, 0.03, 0.1, 0.1, 0.3, 0.3)),
+    "elastic_transmission.j_kgm2": ("inertia", (0.3, 0.6, 0.3, 1.0, 0.3, 2.0)),
+}
+"""Where the search for an effect starts: the unit of each parameter, and multiples of it. Those of one
+effect belong together. Not tuned."""
+
 
 @dataclass(frozen=True)
 class Coordinate:
@@ -168,71 +200,30 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         others: Slots of the other joints of the chain.
         scales: Sizes of the joint's motion.
     """
-    torque, peak, speed = scales.torque, scales.peak, scales.speed
-    small = scales.residual
+    if effect == "joint_coupling":
+        blank = {f"{effect}.from_{slot + 1}": 0.0 for slot in others}
+        return [{**blank, key: factor} for key in blank for factor in (0.05, -0.05)]
     period = EFFECTS["command_delay"].parameters[0].typical
-    table: dict[str, list[dict[str, float]]] = {
-        "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
-        "read_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
-        "command_filter": [{"tau_s": f * period} for f in (0.3, 1.0, 3.0, 10.0)],
-        "acceleration_limit": [
-            {"a_max_rad_s2": f * scales.acceleration} for f in (2.0, 1.0, 0.5, 0.25, 0.1)
-        ],
-        "torque_limit": [{"tau_max_nm": f * peak} for f in (0.9, 0.6, 0.35, 0.2)],
-        "torque_speed_limit": [
-            {"tau_stall_nm": f * peak, "omega_0_rad_s": g * speed}
-            for f, g in ((1.0, 1.1), (1.0, 2.0), (0.5, 1.2), (0.5, 2.5), (0.25, 1.5))
-        ],
-        "torque_saturation": [{"tau_s_nm": f * peak} for f in (1.5, 0.7, 0.35, 0.2)],
-        "supply_sag": [{"relative": f / peak} for f in (0.1, 0.4, 1.2, 4.0)],
-        "thermal_drift": [{"rate_per_s": f / scales.duration} for f in (0.1, 0.5, 1.5)],
-        "coulomb_friction": [{"tau_c_nm": f * torque} for f in (0.03, 0.1, 0.3, 0.7)],
-        "stribeck_friction": [
-            {"tau_s_nm": f * torque, "tau_c_nm": g * torque, "v_s_rad_s": h * speed}
-            for f, g, h in ((0.1, 0.02, 0.05), (0.3, 0.1, 0.05), (0.3, 0.05, 0.2), (0.7, 0.2, 0.05))
-        ],
-        "load_friction": [{"k_load": k} for k in (0.05, 0.15, 0.4)],
-        "asymmetric_friction": [
-            {"tau_plus_nm": f * torque, "tau_minus_nm": g * torque}
-            for f, g in ((0.1, 0.03), (0.03, 0.1), (0.4, 0.1), (0.1, 0.4))
-        ],
-        "backlash": [{"width_rad": f * small} for f in (0.7, 2.0, 5.0)],
-        "dead_zone": [{"width_rad": f * small} for f in (0.7, 2.0, 5.0)],
-        "integral_action": [{"k_i": f * scales.kp} for f in (0.1, 0.5, 2.0, 8.0)],
-        "encoder_bias": [{"bias_rad": f * small} for f in (0.5, -0.5, 1.5, -1.5)],
-        "gravity_load": [
-            {"tau_g_nm": f * torque, "phase_rad": p}
-            for f in (0.1, 0.5)
-            for p in (0.0, 1.57, -1.57, 3.1)
-        ],
-        "payload_inertia": [{"j_kgm2": f * scales.inertia} for f in (0.1, 0.5, 2.0)],
-        "elastic_transmission": [
-            {
-                "k_nm_rad": f * scales.kp,
-                "c_nms_rad": 0.1 * f * scales.kp * period,
-                "j_kgm2": g * scales.inertia,
-            }
-            for f, g in ((0.3, 0.3), (0.3, 0.6), (1.0, 0.3), (1.0, 1.0), (3.0, 0.3), (3.0, 2.0))
-        ],
-        "joint_coupling": [
-            {f"from_{slot + 1}": f if slot == other else 0.0 for slot in others}
-            for other in others
-            for f in (0.05, -0.05)
-        ],
+    units = {
+        **vars(scales),
+        "one": 1.0,
+        "period": period,
+        "damping": scales.kp * period,
+        "sag": 1.0 / scales.peak,
+        "rate": 1.0 / scales.duration,
     }
-    bounds = {p.name: (p.lower, p.upper) for p in EFFECTS[effect].parameters}
-    starts = [
-        {
-            f"{effect}.{name}": value
-            if value <= 0.0
-            else min(max(value, bounds[name][0]), bounds[name][1])
-            for name, value in start.items()
-        }
-        for start in table[effect]
-    ]
+    columns = {}
+    for parameter in EFFECTS[effect].parameters:
+        key = f"{effect}.{parameter.name}"
+        unit, factors = STARTS[key]
+        values = units[unit] * np.array(factors)
+        inside = np.clip(values, parameter.lower, parameter.upper)
+        columns[key] = np.where(values > 0.0, inside, values)
+    count = len(next(iter(columns.values())))
+    starts = [{key: float(values[i]) for key, values in columns.items()} for i in range(count)]
     if effect in SLOWING:
         # The baseline's speed limit took the effect's place: let go of it as well.
-        starts += [{**start, "velocity_limit": FREE_SPEED * speed} for start in starts]
+        starts += [{**start, "velocity_limit": FREE_SPEED * scales.speed} for start in starts]
     if effect in SMOOTHING:
         starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
     return starts

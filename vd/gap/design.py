@@ -69,7 +69,8 @@ def design(
     labels = [str(t.conditions.get(condition)) if condition else t.excitation for t in parts]
     kinds = sorted(set(labels))
     if len(kinds) < 2:
-        labels, kinds = [str(i) for i in trajectories], [str(i) for i in trajectories]
+        labels = [str(i) for i in trajectories]
+        kinds = [str(i) for i in trajectories]
     folds = tuple(kinds.index(label) % MAX_FOLDS for label in labels)
     return tuple(trajectories), folds, aside
 
@@ -87,7 +88,8 @@ def pieces(
     lengths = np.array([recording.trajectories[i].time[-1] for i in trajectories])
     if lengths.sum() <= MAX_MOTION_S:
         return ()
-    left, share = MAX_MOTION_S, 0.0
+    left = MAX_MOTION_S
+    share = 0.0
     for done, length in enumerate(np.sort(lengths)):
         share = left / (len(lengths) - done)
         if length > share:

@@ -8,7 +8,7 @@ Angles are shown in mrad where they are errors and in rad where they are positio
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd.gap.result import Predictions, Report, TrajectoryError
+from vd.gap.result import Predictions, Report
 from vd.gap.words import LISTED
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
@@ -65,12 +65,11 @@ def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) 
         joint: Joint to draw.
         index: Index of the trajectory.
     """
-    column, rows = curves.joints.index(joint), curves.trajectory == index
-    time, command, measured = (
-        curves.time[rows],
-        curves.command[rows, column],
-        curves.measured[rows, column],
-    )
+    column = curves.joints.index(joint)
+    rows = curves.trajectory == index
+    time = curves.time[rows]
+    command = curves.command[rows, column]
+    measured = curves.measured[rows, column]
     models = _models(curves, column, rows)
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
@@ -127,31 +126,23 @@ def residual_figure(report: Report, curves: Predictions, joint: str) -> Figure:
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:
-    """Joint and trajectory index of the overlays.
-
-    Each joint's worst, then other kinds of motion of theirs.
-
-    Joints with a named effect come before others with a gap, and these before the rest.
-    """
-    named = {joint for effect in report.effects for joint in effect.joints}
-    closed = {joint.joint for joint in report.joints if joint.verdict == "no_gap"}
-
-    def order(row: TrajectoryError) -> tuple[bool, bool, float]:
-        return row.joint in closed, row.joint not in named, -row.baseline_rmse_rad
-
-    rows = sorted((row for row in report.trajectories if row.baseline_rmse_rad > 0.0), key=order)
-    worst = {row.joint: row for row in reversed(rows)}
-    kinds = {(row.joint, row.excitation): row for row in reversed(rows)}
-    chosen = [*sorted(worst.values(), key=order), *sorted(kinds.values(), key=order)]
-    pairs = dict.fromkeys((row.joint, curves.files.index(row.file)) for row in chosen)
-    return list(pairs)[:LISTED]
+    """Joint and trajectory index of the overlays: each joint's worst, then other kinds of motion."""
+    rows = sorted(report.trajectories, key=lambda row: -row.baseline_rmse_rad)
+    worst: dict[str, tuple[str, int]] = {}
+    kinds: dict[tuple[str, str], tuple[str, int]] = {}
+    for row in rows:
+        place = (row.joint, curves.files.index(row.file))
+        worst.setdefault(row.joint, place)
+        kinds.setdefault((row.joint, row.excitation), place)
+    return list(dict.fromkeys([*worst.values(), *kinds.values()]))[:LISTED]
 
 
 def _models(
     curves: Predictions, column: int, rows: np.ndarray
 ) -> list[tuple[str, str, np.ndarray]]:
     """Name, colour and positions of the baseline, and of the identified model where it is another."""
-    before, after = curves.baseline[rows, column], curves.identified[rows, column]
+    before = curves.baseline[rows, column]
+    after = curves.identified[rows, column]
     same = np.allclose(before, after, equal_nan=True)
     return [("before", ORANGE, before), *([] if same else [("after", GREEN, after)])]
 

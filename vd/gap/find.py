@@ -33,12 +33,11 @@ def phases(
         resolution: Encoder count [rad].
         top: The joint's largest speed in the recording [rad/s].
     """
-    time, command, position = (
-        trajectory.time,
-        trajectory.command[:, joint],
-        trajectory.position[:, joint],
-    )
-    speed, rest = speed_of(time, position), held(trajectory, joint, resolution)
+    time = trajectory.time
+    command = trajectory.command[:, joint]
+    position = trajectory.position[:, joint]
+    speed = speed_of(time, position)
+    rest = held(trajectory, joint, resolution)
     moving = np.abs(speed) > max(0.02 * top, resolution / SMOOTH_S)
     # The last direction of motion, carried through rests.
     last = (moving * np.sign(speed))[np.maximum.accumulate(moving * np.arange(len(time)))]
@@ -46,7 +45,8 @@ def phases(
     count = np.cumsum(changed)
     onset = changed & (count - 1 == count[np.searchsorted(time, time - HOLD_S)])
     # More than half of the largest is fast, or a hard pull.
-    pull, fast = np.abs(command - position), np.abs(speed) > 0.5 * top
+    pull = np.abs(command - position)
+    fast = np.abs(speed) > 0.5 * top
 
     def after(events: np.ndarray) -> np.ndarray:
         return time - np.maximum.accumulate(np.where(events, time, -np.inf)) <= HOLD_S
@@ -90,14 +90,16 @@ def _joint(
 ) -> list[Misfit]:
     """Findings of a joint from its trajectories and what the model leaves of each [T] [rad]."""
     speeds = [speed_of(t.time, t.position[:, column]) for t, _ in pairs]
-    residual, speed = np.concatenate([left for _, left in pairs]), np.concatenate(speeds)
+    residual = np.concatenate([left for _, left in pairs])
+    speed = np.concatenate(speeds)
     top = float(np.percentile(np.abs(speed), 99.5)) + 1e-9
     masks = [phases(t, column, resolution, top) for t, _ in pairs]
     rows = []
     for phase, when in PHASES.items():
         mask = np.concatenate([m[phase] for m in masks])
         if mask.any() and _rms(residual[mask]) > REPEATABLE * floor:
-            left, direction = residual[mask], np.sign(speed[mask])
+            left = residual[mask]
+            direction = np.sign(speed[mask])
             signature = {
                 "rms_rad": _rms(left),
                 "mean_rad": float(np.mean(left)),
@@ -121,9 +123,11 @@ def _does(signature: Mapping[str, float]) -> str:
     """
     rms, mean, along = (signature[key] for key in ("rms_rad", "mean_rad", "along_motion_rad"))
     if 2.0 * abs(along) > rms:
-        verb, size = ("runs ahead of" if along > 0.0 else "lags behind"), abs(along)
+        verb = "runs ahead of" if along > 0.0 else "lags behind"
+        size = abs(along)
     elif 2.0 * abs(mean) > rms:
-        verb, size = ("sits above" if mean > 0.0 else "sits below"), abs(mean)
+        verb = "sits above" if mean > 0.0 else "sits below"
+        size = abs(mean)
     else:
         return f"is off by {1e3 * rms:.1f} mrad, either way"
     return f"{verb} the model by {1e3 * size:.1f} mrad"

@@ -188,7 +188,10 @@ class JointProblem:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
         chain = self.rollouts.chain
         column = int(chain.columns[self.joint])
-        speeds, accelerations, errors, durations = [], [], [], []
+        speeds = []
+        accelerations = []
+        errors = []
+        durations = []
         for index in self.trajectories:
             trajectory = self.rollouts.recording.trajectories[index]
             speed = speed_of(trajectory.time, trajectory.position[:, column])
@@ -293,7 +296,8 @@ class JointProblem:
         models'.
         """
         fine = copy.copy(self)
-        x, error = fit.x, np.zeros(len(fit.x))
+        x = fit.x
+        error = np.zeros(len(fit.x))
         for divisor in FINER:
             fine.rollouts = self.rollouts.at(self.rollouts.dt / divisor)
             moved = _Descent(fine, fit.rows, fit.coordinates).best([x], ITERATIONS)

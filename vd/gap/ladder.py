@@ -96,7 +96,8 @@ class Ladder:
 
     def fit_changes(self, centre: JointFit) -> None:
         """Fit the models that differ from one in one family, those that promise most."""
-        smaller, starts = [], []
+        smaller = []
+        starts = []
         for effects in rules.changes(centre.effects, self.candidates):
             added = effects - {*centre.effects}
             if not added:

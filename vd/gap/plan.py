@@ -1,6 +1,7 @@
 """The next experiment: a menu of motions by the families of causes that are not told apart."""
 
 import contextlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,11 +56,11 @@ def plan(report: Report, recording: Recording, hand: "HandModel | None") -> Expe
     """
     families = tied(report)
     if families:
-        names = [FAMILIES[name].motions for group in families.values() for name in group]
-        sets = tuple(dict.fromkeys(names))[:SETS]
+        names = itertools.chain.from_iterable(families.values())
+        sets = tuple(dict.fromkeys(FAMILIES[name].motions for name in names))[:SETS]
     else:
         shaky = [row.joint for row in report.joints if row.verdict not in ("effects", "no_gap")]
-        families = {joint: () for joint in shaky or report.recording.joints}
+        families = dict.fromkeys(shaky or report.recording.joints, ())
         sets = (BASIC,) if report.verdict == "under_excited" else UNKNOWN
     menu = excitation_set(_reach(recording, hand), sets)
     menu = [motion for motion in menu if motion.joints[0] in families]
@@ -71,11 +72,10 @@ def plan(report: Report, recording: Recording, hand: "HandModel | None") -> Expe
 
 def tied(report: Report) -> dict[str, tuple[str, ...]]:
     """Families that are not certain, or whose member is not, of each joint that has such."""
+    tied = set().union(*report.open_sets)
     result: dict[str, tuple[str, ...]] = {}
     for row in report.families:
-        several = len(row.effects) > 1 and any(
-            {*row.effects} & {*group} for joint in report.joints for group in joint.open_sets
-        )
+        several = len(row.effects) > 1 and tied.intersection(row.effects)
         if row.verdict in ("likely", "untold") or several:
             result[row.joint] = (*result.get(row.joint, ()), row.name)
     return result
@@ -125,17 +125,19 @@ def _common(recording: Recording) -> dict[str, float | str]:
 def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
     """How far joints may move: in the hand's range, or in that of the commands before."""
     commands = np.concatenate([trajectory.command for trajectory in recording.trajectories])
-    lower, upper = commands.min(axis=0), commands.max(axis=0)
+    lower = commands.min(axis=0)
+    upper = commands.max(axis=0)
     if hand is not None:
         index = [hand.joint_names.index(name) for name in recording.joints]
-        lower, upper = hand.lower[index], hand.upper[index]
+        lower = hand.lower[index]
+        upper = hand.upper[index]
     gains = [float(t.conditions.get("p_gain", 0.0)) for t in recording.trajectories]
     return JointRange(recording.joints, lower, upper, max(gains) or 1.0, (0.0, 0.0))
 
 
 def _sentence(families: Mapping[str, Sequence[str]], sets: Sequence[str], seconds: float) -> str:
     """What to record, and for what."""
-    names = list(dict.fromkeys(name for group in families.values() for name in group))
+    names = list(dict.fromkeys(itertools.chain.from_iterable(families.values())))
     goal = f"to decide on {listing(names)}" if names else "to see what these motions do not show"
     return (
         f"Record the motions {listing(sets)} on {joints_text(tuple(families))}, {seconds:.0f} s, "

@@ -17,13 +17,15 @@ from vd.gap.result import (
     NamedEffect,
     Predictions,
     Report,
+    TrajectoryError,
     WholeModel,
     parameters_of,
 )
 from vd.gap.words import amount, mrad, percent, plain
 from vd.kernels.servo.effects import EFFECTS
 
-REPORT_JSON, REPORT_HTML = "report.json", "report.html"
+REPORT_JSON = "report.json"
+REPORT_HTML = "report.html"
 FIGURES = ("gap.png", "overlay_*.png", "residual_*.png")
 """Those of an earlier analysis go; other motions were drawn."""
 
@@ -46,8 +48,9 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         curves: What the figures draw.
         folder: Folder to write to.
     """
-    for path in (path for pattern in FIGURES for path in Path(folder).glob(pattern)):
-        path.unlink()
+    for pattern in FIGURES:
+        for path in Path(folder).glob(pattern):
+            path.unlink()
     report.write(folder / REPORT_JSON)
 
     def draw(name: str, figure: Figure) -> Path:
@@ -56,7 +59,8 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
             figure.savefig(temporary, dpi=FIGURE_DPI)
         return path
 
-    overlays, residuals = [], {}
+    overlays = []
+    residuals = {}
     with mpl.rc_context(figures.STYLE):
         gap = draw("gap", figures.gap_figure(report))
         for joint, index in figures.chosen_overlays(report, curves):
@@ -78,36 +82,13 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         gap=gap,
         overlays=overlays,
         residuals=residuals,
-        trajectories=[
-            (
-                one.joint,
-                one.excitation,
-                one.file,
-                mrad(one.baseline_rmse_rad),
-                mrad(one.identified_rmse_rad),
-            )
-            for one in report.trajectories
-        ],
+        trajectories=[_trajectory_row(row) for row in report.trajectories],
         families=[_family_row(row) for row in report.families],
         models=[_model_row(row) for row in report.models],
         compared=[_model_row(row) for row in report.compared],
         credits=[_credit_row(report, row) for row in report.credits],
-        not_tried=[
-            (joint, plain(name), plain(reason))
-            for joint, reasons in report.not_tried.items()
-            for name, reason in reasons.items()
-        ],
+        not_tried=_not_tried(report),
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
-        alternatives=[
-            (
-                effect.name,
-                other.name,
-                mrad(other.held_out_rmse_rad),
-                words.mrad_range(other.difference_ci95),
-            )
-            for effect in report.effects
-            for other in effect.alternatives
-        ],
         model=_model(report),
         glossary=[(plain(name), effect.meaning) for name, effect in EFFECTS.items()],
     )
@@ -136,15 +117,26 @@ def _headline(report: Report) -> list[Row]:
 
 
 def _joint_row(report: Report, one: JointGap) -> Row:
-    where = [
-        f.where.removeprefix(f"{one.joint}: ") for f in report.findings if f.joint == one.joint
-    ]
+    own = [finding.where for finding in report.findings if finding.joint == one.joint]
+    where = [text.removeprefix(f"{one.joint}: ") for text in own]
     return (
         one.joint,
         "; ".join(where) or "nothing",
         _VERDICTS[one.verdict].lower(),
         plain(one.reason),
     )
+
+
+def _trajectory_row(row: TrajectoryError) -> Row:
+    errors = mrad(row.baseline_rmse_rad), mrad(row.identified_rmse_rad)
+    return row.joint, row.excitation, row.file, *errors
+
+
+def _not_tried(report: Report) -> list[Row]:
+    rows: list[Row] = []
+    for joint, reasons in report.not_tried.items():
+        rows += [(joint, plain(name), plain(reason)) for name, reason in reasons.items()]
+    return rows
 
 
 def _family_row(row: FamilyVerdict) -> Row:
@@ -179,28 +171,22 @@ def _credit_row(report: Report, row: Credit) -> Row:
 
 
 def _parameters(effects: Iterable[NamedEffect], note: str = "") -> list[Row]:
-    return [
-        (
-            words.joints_text(effect.joints),
-            plain(effect.name) + note,
-            f"{name} = {words.estimate(one)}",
-            "" if note else percent(effect.confidence),
-        )
-        for effect in effects
-        for name, one in effect.parameters.items()
-    ]
+    rows: list[Row] = []
+    for effect in effects:
+        head = words.joints_text(effect.joints), plain(effect.name) + note
+        confidence = "" if note else percent(effect.confidence)
+        for name, one in effect.parameters.items():
+            rows.append((*head, f"{name} = {words.estimate(one)}", confidence))
+    return rows
 
 
 def _model(report: Report) -> list[Row]:
     """Parameters of the plain servo model of every joint, before and after."""
-    return [
-        (
-            joint,
-            f"{name} [{words.unit_text(BASELINE_PARAMETERS[name].unit)}]",
-            f"{before[name]:.3g}" if name in before else "",
-            f"{after[name]:.3g}",
-        )
-        for joint, after in report.identified.parameters.items()
-        for before in [report.baseline.parameters[joint]]
-        for name in after
-    ]
+    rows: list[Row] = []
+    for joint, after in report.identified.parameters.items():
+        before = report.baseline.parameters[joint]
+        for name, value in after.items():
+            unit = words.unit_text(BASELINE_PARAMETERS[name].unit)
+            old = f"{before[name]:.3g}" if name in before else ""
+            rows.append((joint, f"{name} [{unit}]", old, f"{value:.3g}"))
+    return rows

@@ -310,9 +310,10 @@ class Report:
     @property
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
         """The sets in ``ambiguous`` that another recording can split, without what their names stand for."""
-        return tuple(
-            {frozenset(group): group for one in self.joints for group in one.open_sets}.values()
-        )
+        sets: dict[frozenset[str], tuple[str, ...]] = {}
+        for joint in self.joints:
+            sets |= {frozenset(group): group for group in joint.open_sets}
+        return tuple(sets.values())
 
 
 @dataclass(frozen=True)
@@ -382,11 +383,12 @@ def effect_values(
     effects: Sequence[NamedEffect], joint: str
 ) -> dict[str, dict[str, tuple[float, float, float]]]:
     """Effect -> parameter -> (value, low, high) of one joint, as the hand's layer stores them."""
-    return {
-        effect.name: {name: (p.value, *p.ci95) for name, p in effect.parameters.items()}
-        for effect in effects
-        if joint in effect.joints
-    }
+    result = {}
+    for effect in effects:
+        if joint in effect.joints:
+            known = effect.parameters.items()
+            result[effect.name] = {name: (p.value, *p.ci95) for name, p in known}
+    return result
 
 
 def _each_number(value: Any, change: Callable[[float | None], float | None]) -> Any:

@@ -22,28 +22,16 @@ kd).
 """
 
 
-def links_of(
-    axis: np.ndarray,
-    offset: np.ndarray,
-    mass: np.ndarray,
-    com: np.ndarray,
-    inertia: np.ndarray,
-    gravity: np.ndarray,
-) -> Any:
-    """The bodies of a chain [n, ..] as kernels take them."""
-    size = room_for(len(mass))
+def links_of(chain: Any) -> Any:
+    """The bodies of a :class:`Chain`, or of what has the same arrays, as kernels take them."""
+    size = room_for(len(chain.mass))
     links = links_of_size(size)()
-    for name, values in (
-        ("axis", axis),
-        ("offset", offset),
-        ("mass", mass),
-        ("com", com),
-        ("inertia", inertia),
-    ):
+    for name in ("axis", "offset", "mass", "com", "inertia"):
+        values = getattr(chain, name)
         rows = np.zeros((size, *values.shape[1:]))
         rows[: len(values)] = values
         setattr(links, name, type(getattr(links, name))(*rows.ravel().tolist()))
-    links.gravity = wp.vec3(*np.asarray(gravity, float).tolist())
+    links.gravity = wp.vec3(*np.asarray(chain.gravity, float).tolist())
     return links
 
 
@@ -84,7 +72,10 @@ class Rollouts:
         """
         if not dt > 0.0:
             raise ValueError(f"dt is {dt}; give a positive time step in seconds")
-        self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
+        self.chain = chain
+        self.recording = recording
+        self.dt = dt
+        self.device = device
         self._finer: dict[float, Rollouts] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
@@ -114,7 +105,8 @@ class Rollouts:
 
     @cached_property
     def _samples(self) -> Samples:
-        trajectories, columns = self.recording.trajectories, self.chain.columns
+        trajectories = self.recording.trajectories
+        columns = self.chain.columns
         command = np.concatenate([t.command[:, columns] for t in trajectories])
         power = np.concatenate(
             [t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories]
@@ -134,7 +126,8 @@ class Rollouts:
         # In single precision a fraction just under 1 is 1: the next step, which must then be
         # counted.
         fraction = (steps - whole).astype(np.float32)
-        whole, fraction = whole + (fraction >= 1.0), np.where(fraction < 1.0, fraction, 0.0)
+        whole = whole + (fraction >= 1.0)
+        fraction = np.where(fraction < 1.0, fraction, 0.0)
         return (
             wp.array(whole, dtype=int, device=self.device),
             wp.array(fraction, dtype=float, device=self.device),
@@ -148,9 +141,7 @@ class Rollouts:
     def _links(self) -> tuple[Any, wp.array, wp.array, wp.array, wp.array]:
         """The links; slots; lower and upper stops; efforts."""
         chain = self.chain
-        links = links_of(
-            chain.axis, chain.offset, chain.mass, chain.com, chain.inertia, chain.gravity
-        )
+        links = links_of(chain)
         slot = wp.array(chain.slot, dtype=int, device=self.device)
         bounds = (chain.lower, chain.upper, chain.effort)
         lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
@@ -193,10 +184,12 @@ class Rollouts:
             np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
         )
         counts = self._count[chosen]
-        length, width = int(counts.sum()), n if joint is None else 1
+        length = int(counts.sum())
+        width = n if joint is None else 1
         kept = np.ones((len(rows), len(counts)), bool) if keep is None else keep
         index, place = np.nonzero(kept)
-        trajectory, parameters = chosen[place], rows[index]
+        trajectory = chosen[place]
+        parameters = rows[index]
         self._scale_loads(parameters, trajectory)
         output = index * length + (np.cumsum(counts) - counts)[place]
         wanted = np.full(len(index), -1 if joint is None else joint)

@@ -171,14 +171,14 @@ class Evidence:
 
 def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
     """Effects that a joint of a chain can have besides its baseline."""
-    excluded = set()
+    allowed = {*effects}
     if "tau_g_nm" in chain.baseline_free:
-        excluded.add("gravity_load")
+        allowed.discard("gravity_load")
     if "inertia" in chain.baseline_free:
-        excluded.add("payload_inertia")
+        allowed.discard("payload_inertia")
     if len(chain.joints) == 1:
-        excluded.add("joint_coupling")
-    return [name for name in EFFECTS if name in effects and name not in excluded]
+        allowed.discard("joint_coupling")
+    return [name for name in EFFECTS if name in allowed]
 
 
 def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:
@@ -338,7 +338,8 @@ def shown(
     half the interval of its logarithm is less than 1, to first order. Several sizes of one effect
     stand in for each other and say nothing one by one.
     """
-    limits, strengths = [], []
+    limits = []
+    strengths = []
     for parameter in EFFECTS[name].parameters:
         key = f"{name}.{parameter.name}"
         if parameter.column == servo.GRAVITY_PHASE or key not in values:
@@ -358,14 +359,22 @@ def best_of(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
 
 
 def contains(larger: JointFit, smaller: JointFit) -> bool:
-    """Whether a model is another with something added, or with a more general effect for one."""
-    covered = {*larger.effects}
-    for name in larger.effects:
-        covered.update(CONTAINS.get(name, ()))
+    """Whether a model is another with something added, or with a more general effect for one.
+
+    Of two that can do the same, neither contains the other.
+    """
+    return covered(larger) > covered(smaller)
+
+
+def covered(fit: JointFit) -> set[str]:
+    """The effects of a model, and those that it can imitate."""
+    result = {*fit.effects}
+    for name in fit.effects:
+        result.update(CONTAINS.get(name, ()))
     for name, parts in TOGETHER.items():
-        if covered.issuperset(parts):
-            covered.add(name)
-    return larger.effects != smaller.effects and covered.issuperset(smaller.effects)
+        if result.issuperset(parts):
+            result.add(name)
+    return result
 
 
 def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
@@ -377,10 +386,12 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
     fitted = 1.0 - larger.rmse / smaller.rmse
     held_out = 1.0 - larger.held_out_rmse / smaller.held_out_rmse
     if white(evidence, larger):
-        gain, before = fitted, smaller.rmse
+        gain = fitted
+        before = smaller.rmse
         certain = held_out > 0.0
     else:
-        gain, before = min(fitted, held_out), smaller.held_out_rmse
+        gain = min(fitted, held_out)
+        before = smaller.held_out_rmse
         gained, error = paired(evidence, larger, smaller)
         certain = gained > error
     if gain < MIN_GAIN:
@@ -578,7 +589,7 @@ def families_of(
 
     Likely if those that have it predict more than half of the motions best, untold if not.
     """
-    tried = {name for fit in fits for name in fit.effects}
+    tried = set().union(*(fit.effects for fit in fits))
     result: dict[str, Certainty] = {}
     for name, family in FAMILIES.items():
         having = np.array([bool(family.effects.intersection(fit.effects)) for fit in good])
@@ -597,12 +608,17 @@ def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
     loose = []
     for fit in good:
         loose += [name for name in fit.effects if name not in common and name not in loose]
-    sets: list[list[str]] = []
+    sets: list[tuple[str, ...]] = []
     for name in loose:
-        rivals = [group for group in sets if any(apart(name, other, good) for other in group)]
-        merged = [other for group in rivals for other in group]
-        sets = [group for group in sets if group not in rivals] + [[*merged, name]]
-    return [tuple(group) for group in sets]
+        merged: tuple[str, ...] = ()
+        others = []
+        for group in sets:
+            if any(apart(name, other, good) for other in group):
+                merged += group
+            else:
+                others.append(group)
+        sets = [*others, (*merged, name)]
+    return sets
 
 
 def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
@@ -612,4 +628,4 @@ def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:
     """The verdict on a recording: the first, in the order of importance, that some joint has."""
-    return next((verdict for verdict in get_args(Verdict) if verdict in verdicts), "no_gap")
+    return min(verdicts, key=get_args(Verdict).index, default="no_gap")

@@ -34,26 +34,25 @@ HOLD_S = 0.25
 
 def speed_of(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Speed over ``SMOOTH_S`` [T] [rad/s], without the noise of encoder counts."""
-    ends = (np.interp(time + side * SMOOTH_S, time, position) for side in (0.5, -0.5))
-    return np.subtract(*ends) / SMOOTH_S
+    before = np.interp(time - 0.5 * SMOOTH_S, time, position)
+    after = np.interp(time + 0.5 * SMOOTH_S, time, position)
+    return (after - before) / SMOOTH_S
 
 
 def held(trajectory: Trajectory, joint: int, resolution: float) -> np.ndarray:
     """Samples at which command and position both rest, shape [T] bool."""
     time = trajectory.time
+    command = trajectory.command[:, joint]
     first = np.searchsorted(time, time - HOLD_S)
-    changed = (
-        np.abs(np.diff(trajectory.command[:, joint], prepend=trajectory.command[0, joint])) > 0.0
-    )
-    changes = np.cumsum(changed)
-    still = (changes - changes[first] == 0) & (time >= HOLD_S)
-    position = trajectory.position[:, joint]
-    count = max(int(np.median(np.arange(len(time)) - first)), 1)
+    changes = np.cumsum(np.diff(command, prepend=command[0]) != 0.0)
+    still = (changes == changes[first]) & (time >= HOLD_S)
     # Averages of the two halves of the window: slow motion moves them, noise does not.
-    half = max(count // 2, 1)
-    smooth = np.convolve(position, np.ones(half) / half, mode="full")[: len(position)]
-    travel = np.abs(smooth - np.roll(smooth, half))
-    travel[: 2 * half] = np.inf
+    window = np.arange(len(time)) - first
+    half = max(int(np.median(window)) // 2, 1)
+    smooth = np.convolve(trajectory.position[:, joint], np.full(half, 1.0 / half))
+    smooth = smooth[: len(time)]
+    travel = np.full(len(time), np.inf)
+    travel[2 * half :] = np.abs(smooth[2 * half :] - smooth[half:-half])
     return still & (travel < FLICKER_COUNTS * resolution)
 
 
@@ -64,18 +63,21 @@ def noise_floor(recording: Recording, joint: int) -> float:
     not contain it while noise is less than a count), and of what a parabola leaves of slow motion
     (which contains both).
     """
-    quantum = recording.encoder_resolution_rad / np.sqrt(12.0)  # of a uniform error of one count
-    squares, count, moving = 0.0, 0, []
+    resolution = recording.encoder_resolution_rad
+    resting: list[float] = []
+    moving: list[float] = []
     for trajectory in recording.trajectories:
         position = trajectory.position[:, joint]
-        second = position[2:] - 2.0 * position[1:-1] + position[:-2]
-        rest = held(trajectory, joint, recording.encoder_resolution_rad)[1:-1]
-        squares += float(np.sum(second[rest] ** 2))
-        count += int(rest.sum())
-        moving += _slow_noise(trajectory.time, position, recording.encoder_resolution_rad)
-    resting = np.sqrt(squares / (6.0 * count)) if count >= MIN_SAMPLES else 0.0
-    slow = np.sqrt(np.median(moving)) if len(moving) >= MIN_SAMPLES else 0.0
-    return float(max(quantum, resting, slow))
+        rest = held(trajectory, joint, resolution)[1:-1]
+        second = np.diff(position, 2)[rest]
+        resting += (second**2 / 6.0).tolist()  # of white noise of variance 1
+        moving += _slow_noise(trajectory.time, position, resolution)
+    variances = [resolution**2 / 12.0]  # of a uniform error of one count
+    if len(resting) >= MIN_SAMPLES:
+        variances.append(float(np.mean(resting)))
+    if len(moving) >= MIN_SAMPLES:
+        variances.append(float(np.median(moving)))
+    return float(np.sqrt(max(variances)))
 
 
 def _slow_noise(time: np.ndarray, position: np.ndarray, resolution: float) -> list[float]:
@@ -85,11 +87,11 @@ def _slow_noise(time: np.ndarray, position: np.ndarray, resolution: float) -> li
     """
     result = []
     for first in range(0, len(time) - MIN_SAMPLES + 1, MIN_SAMPLES):
-        part = slice(first, first + MIN_SAMPLES)
-        travel = abs(position[part][-1] - position[first]) / resolution
+        here = position[first : first + MIN_SAMPLES]
+        since = time[first : first + MIN_SAMPLES] - time[first]
+        travel = abs(here[-1] - here[0]) / resolution
         if FLICKER_COUNTS < travel <= 2 * MIN_SAMPLES:
-            basis = np.vander(time[part] - time[first], 3)
-            left = position[part] - basis @ np.linalg.lstsq(basis, position[part], rcond=None)[0]
+            left = here - np.polyval(np.polyfit(since, here, 2), since)
             result.append(float(left @ left) / (MIN_SAMPLES - 3))
     return result
 
@@ -118,11 +120,11 @@ def rmse(sse: np.ndarray, count: np.ndarray, weights: np.ndarray | None = None) 
         weights: Weights of the trajectories, shape [R, S]; the result then has a last axis R.
     """
     if weights is None:
-        return np.sqrt(sse.sum(-1) / count.sum())
-    return np.sqrt(np.maximum(sse @ weights.T, 0.0) / np.maximum(weights @ count, 1e-30))
+        weights = np.ones(len(count))
+    return np.sqrt(sse @ weights.T / (weights @ count))
 
 
 def half_width(variance: np.ndarray, units: float) -> np.ndarray:
-    """Half the 95 % interval of estimates whose variance was estimated from ``units`` parts of the data."""
-    freedom = max(units - 1, 1)
-    return float(student.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * np.sqrt(np.maximum(variance, 0.0))
+    """Half the 95 % interval of estimates, their variance from ``units`` parts of the data."""
+    quantile = float(student.ppf(0.5 + 0.5 * CONFIDENCE, max(units - 1, 1)))
+    return quantile * np.sqrt(np.maximum(variance, 0.0))

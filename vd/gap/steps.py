@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
 
 RUN = "run.json"
-FIND, EXPLAIN, CLOSE, CLOSING_CURVES = "find.json", "explain.json", "close.json", "closing.npz"
+FIND = "find.json"
+EXPLAIN = "explain.json"
+CLOSE = "close.json"
+CLOSING_CURVES = "closing.npz"
 CURVES = "predictions.npz"
 OUTPUTS = {
     "find": (FIND,),
@@ -80,7 +83,8 @@ class Analysis:
     """
 
     def __init__(self, settings: Settings, out: Path):
-        self.settings, self.out = settings, Path(out)
+        self.settings = settings
+        self.out = Path(out)
 
     @cached_property
     def recording(self) -> Recording:
@@ -94,7 +98,8 @@ class Analysis:
         Raises:
             ValueError: A hand is named for a recording of a bare servo or pendulum.
         """
-        recording, named = self.recording, self.settings.hand
+        recording = self.recording
+        named = self.settings.hand
         if recording.model not in BARE_MODELS:
             return named or model_path(recording.path, recording.model)
         if named is not None:
@@ -111,10 +116,8 @@ class Analysis:
             return None
         from vd.assets_usd.hands import load_hand, root_name
 
-        hand, model = (
-            load_hand(self.hand_name, layer=self.settings.hand_layer),
-            self.recording.model,
-        )
+        hand = load_hand(self.hand_name, layer=self.settings.hand_layer)
+        model = self.recording.model
         model = root_name(model_path(self.recording.path, model))
         if model != hand.name:
             raise ValueError(
@@ -131,17 +134,15 @@ class Analysis:
         """
         if self.settings.hand_layer is None:
             return {}
-        moved = {joint for trajectory in self.recording.trajectories for joint in trajectory.joints}
+        moved = set().union(*(trajectory.joints for trajectory in self.recording.trajectories))
         joints = tuple(joint for joint in self.recording.joints if joint in moved)
         if self.hand is not None:
-            names = self.hand.joint_names
-            return {
-                joint: self.hand.servo[names.index(joint)] for joint in joints if joint in names
-            }
+            rows = dict(zip(self.hand.joint_names, self.hand.servo, strict=True))
+            return {joint: rows[joint] for joint in moved.intersection(rows)}
         from vd.assets_usd.hand_layer import read_bare_layer
 
-        rows, _ = read_bare_layer(self.settings.hand_layer, joints)
-        return dict(zip(joints, rows, strict=True))
+        found, _ = read_bare_layer(self.settings.hand_layer, joints)
+        return dict(zip(joints, found, strict=True))
 
     def run(self, last: str, *, first: str = STEPS[0], fresh: bool = False) -> None:
         """Run steps up to ``last``; those that have run on the same input are skipped.
@@ -156,13 +157,13 @@ class Analysis:
             ValueError: A setting cannot be used, or a step before ``first`` has not run.
         """
         for index in range(STEPS.index(first), STEPS.index(last) + 1):
-            name, done = STEPS[index], self._done(STEPS[:index])
+            name = STEPS[index]
+            done = self._done(STEPS[:index])
             if name in self._seconds() and not fresh:
                 print(f"{name}: nothing has changed, kept", file=sys.stderr)
                 continue
-            for file in OUTPUTS[
-                name
-            ]:  # what was found before is not what an interrupted step finds
+            # What was found before is not what an interrupted step finds.
+            for file in OUTPUTS[name]:
                 (self.out / file).unlink(missing_ok=True)
             self._note(done)
             print(f"{name}: {_DOES[name]}", file=sys.stderr)
@@ -177,19 +178,20 @@ class Analysis:
             ValueError: One of them has not run on this input.
         """
         seconds = self._seconds()
-        if missing := [name for name in steps if name not in seconds]:
-            again = f"vd-gap {missing[0]} {self.settings.recording} --out {self.out}"
-            raise ValueError(f"{self.out} lacks what comes before; run {again} first")
+        for name in steps:
+            if name not in seconds:
+                again = f"vd-gap {name} {self.settings.recording} --out {self.out}"
+                raise ValueError(f"{self.out} lacks what comes before; run {again} first")
         return {name: seconds[name] for name in steps}
 
     def _seconds(self) -> dict[str, float]:
         """Seconds of every step that has run on this input, and whose files are there."""
         try:
             record = json.loads((self.out / RUN).read_text())
-            ran = record["steps"].items() if record["made_from"] == self._made_from else ()
-            return {
-                name: s for name, s in ran if all((self.out / f).is_file() for f in OUTPUTS[name])
-            }
+            same = record["made_from"] == self._made_from
+            there = {path.name for path in self.out.iterdir()}
+            ran = record["steps"].items()
+            return {name: s for name, s in ran if same and there.issuperset(OUTPUTS[name])}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}  # none, or written by something else: start afresh
 
@@ -201,19 +203,14 @@ class Analysis:
     def _made_from(self) -> str:
         """Digest of everything that the steps are made from."""
         settings = to_dict(replace(self.settings, recording=Path()))
-        digest, folder = (
-            hashlib.sha256(json.dumps([METHOD, settings]).encode()),
-            self.recording.path,
-        )
-        files = ["recording.json", *(trajectory.file for trajectory in self.recording.trajectories)]
-        models = [
-            Path(model) for model in (self.hand_name, self.settings.hand_layer) if model is not None
-        ]
-        for file in (
-            *(folder / name for name in files),
-            *(model for model in models if model.is_file()),
-        ):
-            digest.update(file.read_bytes())
+        digest = hashlib.sha256(json.dumps([METHOD, settings]).encode())
+        recording = self.recording
+        digest.update((recording.path / "recording.json").read_bytes())
+        for trajectory in recording.trajectories:
+            digest.update((recording.path / trajectory.file).read_bytes())
+        for model in (self.hand_name, self.settings.hand_layer):
+            if model is not None and Path(model).is_file():
+                digest.update(Path(model).read_bytes())
         return digest.hexdigest()
 
     def explained(self) -> Report:
@@ -231,8 +228,8 @@ class Analysis:
             "--seed": settings.seed,
             "--device": device,
         }
-        said = [word for flag, value in flags.items() if value for word in (flag, str(value))]
-        return " ".join(["vd-gap run", str(settings.recording), "--out", str(self.out), *said])
+        said = [f" {flag} {value}" for flag, value in flags.items() if value]
+        return f"vd-gap run {settings.recording} --out {self.out}{''.join(said)}"
 
 
 def _show(line: str) -> None:
@@ -268,7 +265,8 @@ def _close(analysis: Analysis) -> None:
     from vd.gap.plan import discard_plan, plan, tied, write_plan
 
     report = analysis.explained()
-    recording, hand = analysis.recording, analysis.hand
+    recording = analysis.recording
+    hand = analysis.hand
     whole = write_identified(report, analysis.out, recording, hand, analysis.start)
     closing, delivered, curves = simulate_again(
         report,

@@ -47,12 +47,10 @@ def telemetry_of(
     (delay,) = EFFECTS["command_delay"].parameters
     late = {}
     for side in ("command_delay", "read_delay"):
-        left = {
-            lag: 1.0 - _follows(parts, chain, joint, **{side: lag})
-            for lag in np.arange(0.0, delay.upper, STEP_S)
-        }
-        best = min(left, key=left.__getitem__)
-        late[side] = float(best), left[best]
+        lags = np.arange(0.0, delay.upper, STEP_S)
+        left = [1.0 - _follows(parts, chain, joint, **{side: lag}) for lag in lags]
+        best = int(np.argmin(left))
+        late[side] = float(lags[best]), left[best]
     return Telemetry(
         fall=_voltage_fall(driven, int(chain.columns[joint])),
         follows=_follows(driven, chain, joint),
@@ -74,7 +72,9 @@ def _follows(
     read_delay: float = 0.0,
 ) -> float:
     """Share of a joint's duty cycle that follows the error if command or reading is that late [s]."""
-    pairs, column, reference = [np.zeros((2, 0))], chain.columns[joint], chain.reference_p_gain
+    pairs = [np.zeros((2, 0))]
+    column = chain.columns[joint]
+    reference = chain.reference_p_gain
     for t in trajectories:
         if t.pwm is not None and _recorded(t.pwm, column):
             duty = t.pwm[:, column]

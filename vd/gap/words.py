@@ -1,8 +1,9 @@
 """What ``vd-gap`` found in plain sentences, for the terminal and the page."""
 
 from collections.abc import Iterable, Sequence
+from typing import get_args
 
-from vd.gap.result import LAYER, Estimate, Interval, NamedEffect, Report, WholeModel
+from vd.gap.result import LAYER, Certainty, Estimate, Interval, NamedEffect, Report, WholeModel
 from vd.gap.statistics import REPEATABLE
 
 LISTED = 4
@@ -126,7 +127,8 @@ def change(report: Report) -> str:
     if not model:
         return ""
     names = causes(sorted(model), "and")
-    before, after = held.baseline_rmse_rad, held.identified_rmse_rad
+    before = held.baseline_rmse_rad
+    after = held.identified_rmse_rad
     text = (
         f"With {names} the error on motions held out {_goes(before, after)} "
         f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); where it was fitted "
@@ -146,7 +148,8 @@ def _judged(report: Report) -> str:
     delivered = report.delivered
     if delivered is None:
         return ""
-    before, after = delivered.baseline_rmse_rad, delivered.rmse_rad
+    before = delivered.baseline_rmse_rad
+    after = delivered.rmse_rad
     text = (
         f" On {delivered.trajectory}, which no fit saw, the layer as written leaves {mrad(after)}, "
         f"the plain model {mrad(before)}."
@@ -158,17 +161,16 @@ def _judged(report: Report) -> str:
 
 def _credit(report: Report) -> str:
     """What the model leaves without each of several effects, so that none has credit for all."""
-    rows = []
-    for joint in dict.fromkeys(row.joint for row in report.credits):
-        credits = [row for row in report.credits if row.joint == joint]
-        if len(credits) > 1:
-            each = [
-                f"{mrad(row.without_held_out_rmse_rad)} without {plain(row.effect)}"
-                for row in credits
-            ]
+    parts: dict[str, list[str]] = {}
+    for row in report.credits:
+        text = f"{mrad(row.without_held_out_rmse_rad)} without {plain(row.effect)}"
+        parts.setdefault(row.joint, []).append(text)
+    sentences = []
+    for joint, each in parts.items():
+        if len(each) > 1:
             where = f" on {joint}" if len(report.joints) > 1 else ""
-            rows.append(f" Each has its part{where}: held out it is {listing(each)}.")
-    return "".join(rows) if len(rows) <= LISTED else ""
+            sentences.append(f" Each has its part{where}: held out it is {listing(each)}.")
+    return "".join(sentences) if len(sentences) <= LISTED else ""
 
 
 def _leftover(report: Report) -> str:
@@ -216,17 +218,16 @@ def model_text(effects: Iterable[str]) -> str:
 
 def families_sentences(report: Report) -> list[str]:
     """What is known of the families of causes, a sentence a joint."""
-    rows = []
-    for joint in dict.fromkeys(row.joint for row in report.families):
-        parts = []
-        for verdict in ("certain", "likely", "untold", "excluded"):
-            names = [
-                row.name for row in report.families if row.joint == joint and row.verdict == verdict
-            ]
-            if names:
-                parts.append(f"{verdict}: {listing(names)}")
-        rows.append(f"{joint}: {'; '.join(parts)}")
-    return rows
+    joints: dict[str, dict[str, list[str]]] = {}
+    for verdict in get_args(Certainty):
+        for row in report.families:
+            if row.verdict == verdict:
+                joints.setdefault(row.joint, {}).setdefault(verdict, []).append(row.name)
+    sentences = []
+    for joint, verdicts in joints.items():
+        parts = [f"{verdict}: {listing(names)}" for verdict, names in verdicts.items()]
+        sentences.append(f"{joint}: {'; '.join(parts)}")
+    return sentences
 
 
 def next_step(report: Report) -> str:

@@ -80,7 +80,8 @@ def find(
     problems, specs = _problems(recording, hand, chosen)
     with _workers(problems, chosen) as pool:
         fits = _identify(pool, problems.chains, specs, chosen)
-    floors, rows = {}, {}
+    floors = {}
+    rows = {}
     for spec, fit in zip(specs, fits, strict=True):
         name = problems.chains[spec.chain].joints[spec.joint]
         floors[name] = spec.floor
@@ -190,7 +191,8 @@ class _JointAnalysis:
             rows: Plain models of the joint's chain [n, PARAMETER_COLUMNS].
             others: Joints that are analysed already.
         """
-        spec, chain = self.spec, self.problems.chains[self.spec.chain]
+        spec = self.spec
+        chain = self.problems.chains[self.spec.chain]
         base = rows.copy()
         for other in others:
             if other.spec.chain == spec.chain:
@@ -236,7 +238,8 @@ class _JointAnalysis:
 
     def candidates(self) -> tuple[list[str], dict[str, str], dict[str, tuple[str, ...]]]:
         """Effects that models may have; those that are not tried, with the reason; what effects stand for."""
-        recording, chain = self.problems.recording, self.problems.chains[self.spec.chain]
+        recording = self.problems.recording
+        chain = self.problems.chains[self.spec.chain]
         spec = self.spec
         telemetry = telemetry_of(recording, chain, spec.joint, spec.trajectories)
         vetoes = rules.contradicted(telemetry)
@@ -271,7 +274,8 @@ def _problems(
 ) -> tuple[Problems, list[JointSpec]]:
     """The problems of a recording, and of which joints: all excited ones."""
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
-    parts, specs = [], []
+    parts = []
+    specs = []
     for index, chain in enumerate(chains(recording, hand)):
         pairs = zip(chain.joints, chain.start_row, strict=True)
         rows = [options.start.get(name, row) for name, row in pairs]

@@ -56,8 +56,9 @@ def battery(
         ValueError: An effect is unknown, or cannot show on the model.
     """
     shown = showing(model)
-    if unknown := [name for name in effects if name not in shown]:
-        raise ValueError(f"--effects: there is no {unknown[0]}; choose from {', '.join(shown)}")
+    for name in effects:
+        if name not in shown:
+            raise ValueError(f"--effects: there is no {name}; choose from {', '.join(shown)}")
     names = tuple(effects) or tuple(name for name in shown if name not in NOT_NAMED)
     changes = ("exact", "base", "mass") if model in HANDS else ("exact", "base")
     numbers = range(first_seed, first_seed + seeds)
@@ -78,7 +79,7 @@ def battery(
         ],
         "outside": sized("outside", (*OUTSIDE, *NOT_NAMED)),
     }
-    return [case for kind in kinds for case in cases[kind]]
+    return list(itertools.chain.from_iterable(cases[kind] for kind in kinds))
 
 
 def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:

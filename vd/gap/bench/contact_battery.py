@@ -19,7 +19,7 @@ from vd.assets_usd.objects.sets import load_set
 from vd.command.files import write_json, write_text
 from vd.gap.bench.cases import run_cases
 from vd.gap.bench.hidden_contact import OUTSIDE, ContactPlant, hide_contact
-from vd.gap.bench.score import Figure
+from vd.gap.bench.score import HEAD, Figure
 from vd.gap.contact import by_weight, identify_contact, verdict
 from vd.logs.contact_recording import read_contact_recording
 
@@ -59,7 +59,8 @@ class ContactCase:
         """The plant with random sizes."""
         rng = np.random.default_rng(self.seed)
         item = load_set(OBJECTS[self.seed % len(OBJECTS)])[0]
-        values, outside = {}, {}
+        values = {}
+        outside = {}
         for name in self.hidden:
             size = rng.uniform(*SIZES[name][rng.integers(len(SIZES[name]))])
             if name in OUTSIDE:
@@ -83,9 +84,8 @@ def battery(which: str, seeds: int) -> list[ContactCase]:
     cases += [("none", ())] * 10 + [("outside", (name,)) for name in OUTSIDE]
     cases *= seeds
     cases += [("pair", pair) for pair in itertools.combinations(CONTACT, 2)] * math.ceil(seeds / 4)
-    return [
-        ContactCase(kind, hidden, FIRST_SEED[which] + i) for i, (kind, hidden) in enumerate(cases)
-    ]
+    first = FIRST_SEED[which]
+    return [ContactCase(kind, hidden, first + i) for i, (kind, hidden) in enumerate(cases)]
 
 
 def run_case(case: ContactCase, folder: Path) -> dict[str, Any]:
@@ -94,21 +94,20 @@ def run_case(case: ContactCase, folder: Path) -> dict[str, Any]:
     with TemporaryDirectory() as work:
         true = hide_contact(plant, Path(work) / "recording")["parameters"]
         found = identify_contact(read_contact_recording(Path(work) / "recording"), plant.item)
+    parameters = {}
+    for each in found:
+        covered = (each.low <= true[each.name]) & (true[each.name] <= each.high)
+        parameters[each.name] = {
+            "true": true[each.name],
+            "value": [v if math.isfinite(v) else None for v in each.value.tolist()],
+            "verdict": each.verdict,
+            "covered": covered.tolist(),
+        }
     result = {
         "case": asdict(case),
         "verdict": verdict(found),
         "named": [each.name for each in by_weight(found)],
-        "parameters": {
-            each.name: {
-                "true": true[each.name],
-                "value": [v if math.isfinite(v) else None for v in each.value.tolist()],
-                "verdict": each.verdict,
-                "covered": (
-                    (each.low <= true[each.name]) & (true[each.name] <= each.high)
-                ).tolist(),
-            }
-            for each in found
-        },
+        "parameters": parameters,
     }
     write_json(folder / f"{case.name}.json", result)
     return result
@@ -133,46 +132,35 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
 
     Then what was not named as hidden.
     """
-
-    def of(kind: str) -> list[Mapping[str, Any]]:
-        return [result for result in results if result["case"]["kind"] == kind]
-
-    def named(result: Mapping[str, Any]) -> list[str]:
-        return list(result.get("named", ["failed"]))
-
-    def hidden(result: Mapping[str, Any]) -> list[str]:
-        return [OUTSIDE.get(name, name) for name in result["case"]["hidden"]]
-
-    def clean(among: Sequence[Mapping[str, Any]]) -> list[bool]:
-        return [set(named(r)) <= set(hidden(r)) for r in among]
-
-    told = [
-        p
-        for r in results
-        if r["case"]["kind"] != "outside"
-        for p in r.get("parameters", {}).values()
-    ]
-    covers = [c for p in told if p["verdict"] != "unknown" for c in p["covered"]]
+    right: dict[str, list[bool]] = {"single": [], "none": [], "pair": [], "outside": []}
+    clean: dict[str, list[bool]] = {kind: [] for kind in right}
+    first: list[bool] = []
+    told: list[bool] = []
+    covers: list[bool] = []
+    lines: list[str] = []
+    for result in results:
+        case = ContactCase(**result["case"])
+        named = list(result.get("named", ["failed"]))
+        hidden = [OUTSIDE.get(name, name) for name in case.hidden]
+        right[case.kind].append({*named} == {*hidden})
+        clean[case.kind].append({*named} <= {*hidden})
+        if case.kind == "outside":
+            continue
+        if case.kind == "single":
+            first.append(named[:1] == hidden)
+        for parameter in result.get("parameters", {}).values():
+            told.append(parameter["verdict"] != "unknown")
+            covers += parameter["covered"] if told[-1] else []
+        if not right[case.kind][-1]:
+            lines.append(f"- {case.name}: {', '.join(named) or 'nothing'}")
     figures = [
-        Figure("first name right", [named(r)[:1] == hidden(r) for r in of("single")], least=0.9),
-        Figure("one hidden: no false name", clean(of("single")), least=0.98),
-        Figure("nothing hidden: no false name", clean(of("none")), least=0.98),
-        Figure(
-            "two hidden: both named, nothing else",
-            [set(named(r)) == set(hidden(r)) for r in of("pair")],
-        ),
-        Figure("outside the table: nothing or the nearest", clean(of("outside"))),
+        Figure("first name right", first, least=0.9),
+        Figure("one hidden: no false name", clean["single"], least=0.98),
+        Figure("nothing hidden: no false name", clean["none"], least=0.98),
+        Figure("two hidden: both named, nothing else", right["pair"]),
+        Figure("outside the table: nothing or the nearest", clean["outside"]),
         Figure("95 % intervals that cover", covers),
-        Figure("parameters told", [p["verdict"] != "unknown" for p in told]),
+        Figure("parameters told", told),
     ]
-    wrong = [
-        r for r in results if set(named(r)) != set(hidden(r)) and r["case"]["kind"] != "outside"
-    ]
-    lines = [
-        f"- {ContactCase(**r['case']).name}: {', '.join(named(r)) or 'nothing'}" for r in wrong
-    ]
-    head = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
-    return (
-        "\n".join([*head, *(figure.row() for figure in figures), "", "Not as hidden:", "", *lines])
-        + "\n"
-    )
+    rows = [figure.row() for figure in figures]
+    return "\n".join([*HEAD, *rows, "", "Not as hidden:", "", *lines, ""])

@@ -32,8 +32,12 @@ OUTSIDE = {
 the speed, a tip that stiffens, a table that is not level."""
 CONTACT_RATE = 800.0
 """Natural frequency of the table's contact [rad/s]: an impact lasts 4 ms."""
-TIP_KG, TIP_RADIUS_M, TIP_DAMPING = 0.01, 0.008, 0.3
-"""Pusher: its mass, radius, and damping ratio on its spring."""
+TIP_KG = 0.01
+"""Mass of the pusher [kg]."""
+TIP_RADIUS_M = 0.008
+"""Radius of the pusher [m]."""
+TIP_DAMPING = 0.3
+"""Damping ratio of the pusher on its spring."""
 RIGID_N_M = 2.0e4
 """Stiffness of a pusher without compliance [N/m]: no real one is rigid."""
 CORNER_M = 2.0e-4
@@ -76,7 +80,8 @@ class World:
     """The compiled scene of one motion, and what happens in it step by step."""
 
     def __init__(self, plant: ContactPlant, rng: np.random.Generator, *, finger: bool):
-        self.friction, outside = plant.value("table_friction"), plant.outside
+        self.friction = plant.value("table_friction")
+        outside = plant.outside
         self.speed_friction = outside.get("speed_friction", 0.0)
         self.stiffening = outside.get("stiffening_tip", 0.0)
         self.stiffness = 1.0 / plant.value("tip_compliance")
@@ -84,7 +89,8 @@ class World:
         self.corners = np.unique(
             np.concatenate([vertices for vertices, _ in plant.item.hulls]), axis=0
         )
-        spec, tilt = mujoco.MjSpec(), outside.get("tilted_table", 0.0)
+        spec = mujoco.MjSpec()
+        tilt = outside.get("tilted_table", 0.0)
         spec.option.gravity = [GRAVITY_M_S2 * math.sin(tilt), 0.0, -GRAVITY_M_S2 * math.cos(tilt)]
         spec.option.timestep = self.step = rng.choice([4.0e-4, 5.0e-4])
         spec.option.integrator = rng.choice(
@@ -95,10 +101,8 @@ class World:
             tip = spec.worldbody.add_body(name="tip", gravcomp=1.0)
             for axis in np.eye(3):
                 tip.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            size, stiff = (
-                [TIP_RADIUS_M, 0.0, 0.0],
-                {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 1e-3, 0.5, 2.0]},
-            )
+            size = [TIP_RADIUS_M, 0.0, 0.0]
+            stiff = {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 1e-3, 0.5, 2.0]}
             tip.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=size,
@@ -119,15 +123,19 @@ class World:
 
         Between a mesh and a plane MuJoCo finds three contacts, on which a cube rocks.
         """
-        item, mass, kinds = plant.item, plant.value("mass"), mujoco.mjtGeom
+        item = plant.item
+        mass = plant.value("mass")
+        kinds = mujoco.mjtGeom
         spec.worldbody.add_geom(
             name="table", type=kinds.mjGEOM_PLANE, size=[2, 2, 0.1], contype=0, conaffinity=0
         )
         body = spec.worldbody.add_body(name="object", explicitinertial=True)
         body.add_freejoint()
         x, y, z, w = item.inertia_quat
-        body.mass, body.ipos = mass, plant.value("centre_of_mass")
-        body.inertia, body.iquat = item.inertia * mass / item.mass_kg, [w, x, y, z]
+        body.mass = mass
+        body.ipos = plant.value("centre_of_mass")
+        body.inertia = item.inertia * mass / item.mass_kg
+        body.iquat = [w, x, y, z]
         for i, (vertices, faces) in enumerate(item.hulls):
             spec.add_mesh(name=f"hull_{i}", uservert=vertices.flatten(), userface=faces.flatten())
             body.add_geom(type=kinds.mjGEOM_MESH, meshname=f"hull_{i}", contype=1, conaffinity=0)
@@ -137,7 +145,8 @@ class World:
             "solimp": [0.999, 0.999, 1e-3, 0.5, 2.0],
         }
         for i, corner in enumerate(self.corners):
-            name, size = f"corner_{i}", [CORNER_M, 0.0, 0.0]
+            name = f"corner_{i}"
+            size = [CORNER_M, 0.0, 0.0]
             body.add_geom(
                 name=name, type=kinds.mjGEOM_SPHERE, size=size, pos=corner, contype=0, conaffinity=0
             )
@@ -154,7 +163,8 @@ class World:
 
     def run(self, seconds: float, way: Way | None = None, hand: np.ndarray | None = None) -> Truth:
         """Steps with the pusher's rigid part on its way, or a hand's wrench [6] during PUSH_OFF_S."""
-        rows, data = [], self.data
+        rows = []
+        data = self.data
         if way is not None:
             self.carriage = data.qpos[7:10] = way(0.0)
         for i in range(round(seconds / self.step)):
@@ -199,7 +209,8 @@ class World:
         normal = data.efc_force[data.contact.efc_address[touching]]
         turn = data.xmat[1].reshape(3, 3)
         x, y, z = turn @ self.corners[data.contact.geom2[touching] - self._first_corner].T
-        (vx, vy, _), (wx, wy, wz) = data.qvel[:3], turn @ data.qvel[3:6]
+        vx, vy, _ = data.qvel[:3]
+        wx, wy, wz = turn @ data.qvel[3:6]
         slip = np.array([vx + wy * z - wz * y, vy + wz * x - wx * z])
         speed = np.sqrt((slip**2).sum(0)) + 1e-9
         size = self.friction * (1.0 + self.speed_friction * speed) * normal
@@ -213,7 +224,8 @@ class World:
 def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generator) -> Truth:
     """One motion of a kind as it truly is; every other drop is a toss."""
     world = World(plant, rng, finger=kind in ("push", "press"))
-    low, high = world.corners[:, 2].min() - CORNER_M, world.corners[:, 2].max()
+    low = world.corners[:, 2].min() - CORNER_M
+    high = world.corners[:, 2].max()
     upright = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi))
     if kind == "drop":
         return _drop(world, upright, rng, flat=number % 2 == 0)
@@ -221,26 +233,23 @@ def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generat
     world.place(np.array([0.0, 0.0, -low]), upright, none, none)
     ahead = upright.apply([1.0, 0.0, 0.0])
     if kind == "slide":
-        speed, mass, inertia = (
-            rng.uniform(0.8, 1.6),
-            world.model.body_mass[1],
-            world.model.body_inertia[1, 2],
-        )
+        speed = rng.uniform(0.8, 1.6)
+        mass = world.model.body_mass[1]
+        inertia = world.model.body_inertia[1, 2]
         ahead = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi)).apply(ahead)
         push = mass * (speed / PUSH_OFF_S + world.friction * GRAVITY_M_S2) * ahead
         return world.run(
             0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S])
         )
     if kind == "press":
-        above, force = (
-            np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004]),
-            rng.uniform(3.0, 8.0),
-        )
+        above = np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004])
+        force = rng.uniform(3.0, 8.0)
         down = np.array([0.0, 0.0, 0.004 + force * plant.value("tip_compliance")])
         return world.run(0.6, lambda t: above - down * math.sin(math.pi * t / 0.6) ** 2)
     reach = float(np.linalg.norm(world.corners[:, :2], axis=1).max()) + TIP_RADIUS_M + 0.01
     behind = upright.apply([-reach, rng.normal(0.0, 0.002), 0.4 * (high - low)])
-    speed, acceleration = rng.uniform(0.08, 0.15), rng.uniform(0.0, 0.3)
+    speed = rng.uniform(0.08, 0.15)
+    acceleration = rng.uniform(0.0, 0.3)
     return world.run(0.9, lambda t: behind + ahead * (speed * t + 0.5 * acceleration * t**2))
 
 
@@ -258,10 +267,8 @@ def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bo
     before = np.arange(0.0, PUSH_OFF_S, world.step)
     way = 0.5 * before**2 / PUSH_OFF_S - 0.5 * PUSH_OFF_S
     turned = Rotation.from_rotvec(np.outer(way, spin)) * tilt
-    held, nothing = (
-        np.hstack([place + np.outer(way, velocity), turned.as_quat()]),
-        np.zeros((len(before), 3)),
-    )
+    held = np.hstack([place + np.outer(way, velocity), turned.as_quat()])
+    nothing = np.zeros((len(before), 3))
     parts = (held, pose), (nothing, pusher), (nothing, force)
     pose, pusher, force = (np.concatenate(part) for part in parts)
     return np.concatenate([before, time + PUSH_OFF_S]), pose, pusher, force
@@ -274,16 +281,20 @@ class ImperfectTracker:
     """
 
     def __init__(self, rng: np.random.Generator):
-        self._rng, self.rate = rng, rng.uniform(100.0, 240.0)
-        self.position_m, self.rotation_rad = rng.uniform(1e-4, 6e-4), rng.uniform(1e-3, 8e-3)
-        self.late_s, self.force_n = rng.uniform(0.0, 1e-3), rng.uniform(0.005, 0.02)
+        self._rng = rng
+        self.rate = rng.uniform(100.0, 240.0)
+        self.position_m = rng.uniform(1e-4, 6e-4)
+        self.rotation_rad = rng.uniform(1e-3, 8e-3)
+        self.late_s = rng.uniform(0.0, 1e-3)
+        self.force_n = rng.uniform(0.005, 0.02)
 
     def see(self, truth: Truth, kind: Kind, file: str) -> ContactMotion:
         """States are late, some by a frame, and stamped with when they were asked for.
 
         Some are missing.
         """
-        rng, (time, pose, pusher, force) = self._rng, truth
+        rng = self._rng
+        time, pose, pusher, force = truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
         asked = asked[rng.uniform(size=len(asked)) > 0.02]
         late = (
@@ -296,7 +307,8 @@ class ImperfectTracker:
             return values[at, :3] + rng.normal(0.0, deviation, (len(at), 3))
 
         turned = Rotation.from_rotvec(rng.normal(0.0, self.rotation_rad, (len(at), 3)))
-        position, rotation = noisy(pose, self.position_m), turned * Rotation.from_quat(pose[at, 3:])
+        position = noisy(pose, self.position_m)
+        rotation = turned * Rotation.from_quat(pose[at, 3:])
         pushes = kind in ("push", "press")
         bias = rng.normal(0.0, self.force_n / 3.0, 3)
         measured = (noisy(pusher, self.position_m), noisy(force, self.force_n) + bias)

@@ -30,13 +30,15 @@ def finger_of(hand: HandModel, finger: int, heavier: np.ndarray, payload: float 
     """
     joints = np.arange(hand.num_joints)[hand.fingers[finger]]
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
-    parents, frames = poses[hand.joint_parent[joints]], hand.joint_parent_frame[joints]
+    parents = poses[hand.joint_parent[joints]]
+    frames = hand.joint_parent_frame[joints]
     turns = Rotation.from_quat(parents[:, 3:])
     place = parents[:, :3] + turns.apply(frames[:, :3])
     axis = (turns * Rotation.from_quat(frames[:, 3:])).apply(hand.joint_axis[joints])
     links = hand.joint_child[joints]
     own = Rotation.from_quat(poses[links, 3:])
-    matrix, offset = own.as_matrix(), np.diff(place, axis=0, prepend=np.zeros((1, 3)))
+    matrix = own.as_matrix()
+    offset = np.diff(place, axis=0, prepend=np.zeros((1, 3)))
     com = poses[links, :3] + own.apply(hand.link_com[links]) - place
     inertia = matrix @ hand.link_inertia[links] @ matrix.transpose(0, 2, 1) * heavier[:, None, None]
     spec = mujoco.MjSpec()
@@ -64,7 +66,8 @@ class Finger:
     """
 
     def __init__(self, models: Sequence[Any]):
-        self._models, self._data = models, [mujoco.MjData(model) for model in models]
+        self._models = models
+        self._data = [mujoco.MjData(model) for model in models]
 
     def weight(self, q: np.ndarray) -> np.ndarray:
         """Torques that hold the fingers against gravity [B, n] [N m]."""
@@ -72,9 +75,11 @@ class Finger:
 
     def _forward(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mass matrices [B, n, n] [kg m^2], and what gravity and speeds pull [B, n] [N m]."""
-        mass, bias = np.empty((*q.shape, q.shape[1])), np.empty_like(q)
+        mass = np.empty((*q.shape, q.shape[1]))
+        bias = np.empty_like(q)
         for i, (model, data) in enumerate(zip(self._models, self._data, strict=True)):
-            data.qpos[:], data.qvel[:] = q[i], v[i]
+            data.qpos[:] = q[i]
+            data.qvel[:] = v[i]
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
             mujoco.mj_fullM(model, data, mass[i])
@@ -105,7 +110,8 @@ class Finger:
             dt: Time step [s].
         """
         links, bias = self._forward(q, v)
-        system, n = links / dt, q.shape[1]
+        system = links / dt
+        n = q.shape[1]
         system[:, np.arange(n), np.arange(n)] += inertia / dt + resisting
         momentum = np.einsum("bij,bj->bi", system, v) + push - bias
         new = v.copy()

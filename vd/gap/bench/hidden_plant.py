@@ -153,7 +153,8 @@ def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[Plant
     batch = _Batch(runs, dt)
     path, asked = batch.integrate(batch.references())
     grid = np.arange(path.shape[0]) * dt
-    delay, bias = batch.of("read_delay", "delay_s"), batch.of("encoder_bias", "bias_rad")
+    delay = batch.of("read_delay", "delay_s")
+    bias = batch.of("encoder_bias", "bias_rad")
     recorded = []
     for b, run in enumerate(runs):
         columns = [
@@ -170,7 +171,8 @@ class _Batch:
     """Runs as arrays [B, J], and their integration."""
 
     def __init__(self, runs: Sequence[PlantRun], dt: float):
-        self.runs, self.dt = runs, dt
+        self.runs = runs
+        self.dt = dt
         plants = [run.plant for run in runs]
         self.plants = plants
         self.count = len(plants[0].joints)
@@ -186,13 +188,10 @@ class _Batch:
 
     def of(self, effect: str, parameter: str) -> np.ndarray:
         """A parameter of an effect for every run and joint [B, J]; 0 where the effect is absent."""
-        zero = np.zeros(self.count)
-        return np.stack(
-            [
-                np.broadcast_to(p.effects.get(effect, {}).get(parameter, zero), zero.shape)
-                for p in self.plants
-            ]
-        )
+        values = np.zeros((len(self.plants), self.count))
+        for row, plant in zip(values, self.plants, strict=True):
+            row[:] = plant.effects.get(effect, {}).get(parameter, 0.0)
+        return values
 
     def _finger(self) -> Finger | None:
         loads = [float(run.conditions.get("payload_kg", 0.0)) for run in self.runs]
@@ -208,8 +207,10 @@ class _Batch:
         """
         dt = self.dt / PARTS
         edges = np.arange(self.steps * PARTS + 1) * dt
-        delay, sigma = self.of("command_delay", "delay_s"), self.of("command_jitter", "sigma_s")
-        drop, tau = self.of("command_jitter", "p_drop"), self.of("command_filter", "tau_s")
+        delay = self.of("command_delay", "delay_s")
+        sigma = self.of("command_jitter", "sigma_s")
+        drop = self.of("command_jitter", "p_drop")
+        tau = self.of("command_filter", "tau_s")
         result = np.empty((self.steps * PARTS, len(self.runs), self.count))
         for b, run in enumerate(self.runs):
             rng = np.random.default_rng(run.seed)
@@ -237,8 +238,10 @@ class _Batch:
         on = limit > 0.0
         if not on.any():
             return
-        dt, bound = self.dt / PARTS, limit[on]
-        position, speed = reference[0][on], np.zeros(int(on.sum()))
+        dt = self.dt / PARTS
+        bound = limit[on]
+        position = reference[0][on]
+        speed = np.zeros(int(on.sum()))
         for k in range(len(reference)):
             start = position
             away = reference[k][on] - position
@@ -255,7 +258,8 @@ class _Batch:
         on = half > 0.0
         if not on.any():
             return
-        gap, output = half[on], reference[0][on]
+        gap = half[on]
+        output = reference[0][on]
         for k in range(len(reference)):
             target = reference[k][on]
             output = np.minimum(np.maximum(output, target - gap), target + gap)
@@ -274,8 +278,11 @@ class _Batch:
 
         Also what the controllers ask for in each step, as an error at full gain [K, B, J] [rad].
         """
-        dt, half = self.dt, 0.5 * self.dt
-        loads, motor, switch = _Loads(self, dt), _Servo(self), self._switch()
+        dt = self.dt
+        half = 0.5 * self.dt
+        loads = _Loads(self, dt)
+        motor = _Servo(self)
+        switch = self._switch()
         dead = 0.5 * self.of("dead_zone", "width_rad")
         integral_gain = self.of("integral_action", "k_i")
         coupling = np.stack(
@@ -283,8 +290,10 @@ class _Batch:
         )
         coupling *= 1.0 - np.eye(self.count)
         q = self._equilibrium(reference[0, 0], switch[0], coupling)
-        v, wound = np.zeros_like(q), np.zeros_like(q)
-        path, asked = np.empty((self.steps + 1, *q.shape)), np.empty((self.steps, *q.shape))
+        v = np.zeros_like(q)
+        wound = np.zeros_like(q)
+        path = np.empty((self.steps + 1, *q.shape))
+        asked = np.empty((self.steps, *q.shape))
         path[0] = q
         loads.start(q)
         for k, on in enumerate(switch):
@@ -329,7 +338,8 @@ class _Batch:
         minus, plus = loads.friction(carried, sliding, time)
         elastic = loads.presliding > 0.0
         push = push - np.where(elastic, loads.bent(v, minus, plus), 0.0)
-        minus, plus = np.where(elastic, 0.0, minus), np.where(elastic, 0.0, plus)
+        minus = np.where(elastic, 0.0, minus)
+        plus = np.where(elastic, 0.0, plus)
         if self.body is not None:
             zero = np.zeros_like(v)
             return self.body.velocity(
@@ -345,7 +355,8 @@ class _Batch:
 
         One that is off starts at the reference.
         """
-        tau, phase = self.of("gravity_load", "tau_g_nm"), self.of("gravity_load", "phase_rad")
+        tau = self.of("gravity_load", "tau_g_nm")
+        phase = self.of("gravity_load", "phase_rad")
         stiffness = np.maximum(self.kp * self.gain, 1e-9)
         q = reference.copy()
         for _ in range(EQUILIBRIUM_SWEEPS):
@@ -405,9 +416,11 @@ class _Servo:
         """
         share = 1.0 / (1.0 + self.sag * np.abs(wanted))
         cool = np.exp(-self.rate * time)
-        torque, slope = cool * share * wanted, cool * share * share
+        torque = cool * share * wanted
+        slope = cool * share * share
         bent = np.tanh(torque / self.soft)
-        torque, slope = self.soft * bent, slope * (1.0 - bent * bent)
+        torque = self.soft * bent
+        slope = slope * (1.0 - bent * bent)
         slope = slope * (np.abs(torque) < self.hard)
         torque = np.clip(torque, -self.hard, self.hard)
         if self.stalls:
@@ -433,32 +446,40 @@ class _Loads:
 
     def __init__(self, batch: _Batch, dt: float):
         of = batch.of
-        self.dt, self.pendulum = dt, batch.pendulum
-        self.weight, self.phase = of("gravity_load", "tau_g_nm"), of("gravity_load", "phase_rad")
-        self.ripple, self.turns = of(COGGING, "amplitude_nm"), of(COGGING, "per_turn")
-        self.cable, self.slack = of(CABLE, "k_nm_rad"), of(CABLE, "slack_rad")
+        self.dt = dt
+        self.pendulum = batch.pendulum
+        self.weight = of("gravity_load", "tau_g_nm")
+        self.phase = of("gravity_load", "phase_rad")
+        self.ripple = of(COGGING, "amplitude_nm")
+        self.turns = of(COGGING, "per_turn")
+        self.cable = of(CABLE, "k_nm_rad")
+        self.slack = of(CABLE, "slack_rad")
         spring = "elastic_transmission"
-        self.spring, self.loss = of(spring, "k_nm_rad"), of(spring, "c_nms_rad")
+        self.spring = of(spring, "k_nm_rad")
+        self.loss = of(spring, "c_nms_rad")
         self.mass = np.where(self.spring > 0.0, of(spring, "j_kgm2"), 1.0)
         if (self.spring * dt * dt + self.loss * dt >= self.mass).any():
             raise ValueError(
                 f"{spring} is too stiff for a step of {dt:g} s: raise j_kgm2, or lower k_nm_rad"
             )
-        self.load, self.static = of("load_friction", "k_load"), of("stribeck_friction", "tau_s_nm")
+        self.load = of("load_friction", "k_load")
+        self.static = of("stribeck_friction", "tau_s_nm")
         self.sliding, self.scale = (
             of("stribeck_friction", name) for name in ("tau_c_nm", "v_s_rad_s")
         )
         self.sides = [of("asymmetric_friction", name) for name in ("tau_minus_nm", "tau_plus_nm")]
         self.constant = of("coulomb_friction", "tau_c_nm") + self.sliding
-        self.cold, self.warm = of(WARMING, "cold_nm"), of(WARMING, "warm_nm")
-        self.warming, self.scale = _where_on(of(WARMING, "time_s")), _where_on(self.scale)
+        self.cold = of(WARMING, "cold_nm")
+        self.warm = of(WARMING, "warm_nm")
+        self.warming = _where_on(of(WARMING, "time_s"))
+        self.scale = _where_on(self.scale)
         self.session = np.array([[run.session_s] for run in batch.runs])
         self.loads = self.load.any()
         self.turn = self.rate = self.strain = np.zeros_like(self.weight)
-        self.presliding, self.gear, self.teeth = (
-            np.array([[getattr(p.physics, name)] for p in batch.plants]) + self.strain
-            for name in ("presliding_rad", "ripple_nm", "ripple_per_turn")
-        )
+        physics = [plant.physics for plant in batch.plants]
+        self.presliding = np.array([[each.presliding_rad] for each in physics]) + self.strain
+        self.gear = np.array([[each.ripple_nm] for each in physics])
+        self.teeth = np.array([[each.ripple_per_turn] for each in physics])
 
     def bend(self, v: np.ndarray) -> None:
         """Bend what carries dry friction by a step at speeds [B, J]."""
@@ -474,7 +495,8 @@ class _Loads:
 
     def start(self, q: np.ndarray) -> None:
         """Put the second masses at rest on the joints."""
-        self.turn, self.rate = q.copy(), np.zeros_like(q)
+        self.turn = q.copy()
+        self.rate = np.zeros_like(q)
 
     def __call__(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Torques [B, J] [N m] at positions and speeds; the second masses move on."""

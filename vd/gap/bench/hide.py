@@ -89,7 +89,6 @@ class Hiding:
         effects: Name to parameter to value; absent parameters take typical values.
         seed: Of base parameters, noise, jitter.
         joints: Joints recorded; empty: the first finger, or the one joint of a bare model.
-        effect_joints: Joints that have the effect; absent or empty: all.
         excitations: Sets of :data:`vd.logs.excitations.MENU`.
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the
             hand's.
@@ -102,7 +101,6 @@ class Hiding:
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     seed: int = 0
     joints: tuple[str, ...] = ()
-    effect_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     excitations: tuple[str, ...] = ("steps_and_sines",)
     base_spread: float = BASE_SPREAD
     mass_spread: float = 0.0
@@ -124,25 +122,21 @@ class Hidden:
     truth: dict[str, Any]
 
 
-def parse_effect(text: str) -> tuple[str, dict[str, float], tuple[str, ...]]:
-    """Read ``NAME[@joint+joint..][:p=v,..]``.
-
-    Returns:
-        Name, the parameters given, and the joints (empty: all).
+def parse_effect(text: str) -> tuple[str, dict[str, float]]:
+    """Name and given parameters of ``NAME[:p=v,..]``.
 
     Raises:
         ValueError: A value is no number. What there is to hide, :func:`hide` knows.
     """
-    head, _, tail = text.partition(":")
-    name, _, joints = head.partition("@")
+    name, _, tail = text.partition(":")
     values: dict[str, float] = {}
-    for item in filter(None, (part.strip() for part in tail.split(","))):
-        key, _, value = (part.strip() for part in item.partition("="))
+    for item in tail.split(",") if tail else ():
+        key, _, value = item.partition("=")
         try:
-            values[key] = float(value)
+            values[key.strip()] = float(value)
         except ValueError as error:
             raise ValueError(f"effect {text!r}: {key} is {value!r}; write {key}=NUMBER") from error
-    return name.strip(), values, tuple(filter(None, (joint.strip() for joint in joints.split("+"))))
+    return name.strip(), values
 
 
 def effect_parameters(name: str) -> dict[str, float]:
@@ -285,7 +279,12 @@ class _Session:
         return Hidden(recording, self._truth())
 
     def _truth(self) -> dict[str, Any]:
-        plant, hiding = self.plant, self.hiding
+        plant = self.plant
+        hiding = self.hiding
+        effects: dict[str, Any] = {}
+        for name, parameters in plant.effects.items():
+            values = {key: _by_joint(plant, value) for key, value in parameters.items()}
+            effects[name] = {"joints": list(plant.joints), "parameters": values}
         return {
             "format": "vd-hidden/1",
             "model": hiding.model,
@@ -293,15 +292,7 @@ class _Session:
             "noise_floor_rad": NOISE_FLOOR_RAD,
             "mass_spread": hiding.mass_spread,
             "base": {name: _by_joint(plant, getattr(plant, name)) for name in BASE},
-            "effects": {
-                name: {
-                    "joints": list(_effect_joints(hiding, name, plant.joints)),
-                    "parameters": {
-                        key: _by_joint(plant, values) for key, values in parameters.items()
-                    },
-                }
-                for name, parameters in plant.effects.items()
-            },
+            "effects": effects,
         }
 
 
@@ -323,24 +314,13 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Hidde
                 raise ValueError(f"{name}: {key} is {value}; give a finite number")
             if value < 0.0 and key not in signed:
                 raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
-        having = _effect_joints(hiding, name, plant.joints)
         if name == COUPLING and len(plant.joints) == 1:
             raise ValueError(
                 f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand"
             )
-        on = np.array([joint in having for joint in plant.joints], dtype=float)
+        on = np.ones(len(plant.joints))
         effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
     return reach, replace(plant, effects=effects, physics=hiding.physics)
-
-
-def _effect_joints(hiding: Hiding, name: str, joints: tuple[str, ...]) -> tuple[str, ...]:
-    having = tuple(hiding.effect_joints.get(name, ())) or joints
-    for joint in having:
-        if joint not in joints:
-            raise ValueError(
-                f"effect {name}: unknown joint {joint!r}; recorded are {', '.join(joints)}"
-            )
-    return having
 
 
 def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
@@ -376,7 +356,8 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Hidde
         raise ValueError(
             f"{hand.name}: some joints follow others, which the gap workflow does not model"
         )
-    finger, n = fingers.index(joints), len(joints)
+    finger = fingers.index(joints)
+    n = len(joints)
     index = hand.fingers[finger]
     near = _spread(rng, hiding.base_spread, (3, n))
     heavy = _spread(rng, hiding.mass_spread, (n,))

@@ -1,8 +1,6 @@
 """Compare what the gap workflow says with what was hidden, and gather the figures to reach."""
 
-import itertools
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -12,7 +10,7 @@ import numpy as np
 from vd.gap.bench.hidden_plant import CABLE, COGGING, TUNED, WARMING, Physics
 from vd.gap.bench.hide import Hiding
 from vd.gap.bench.sizes import sized_effect
-from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
+from vd.kernels.servo.effects import TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")
 MASS_SPREAD = 0.2
@@ -126,7 +124,8 @@ class Case:
 
     def hiding(self) -> Hiding:
         """The recording to make."""
-        index, battery = KINDS.index(self.kind), BATTERIES[self.battery]
+        index = KINDS.index(self.kind)
+        battery = BATTERIES[self.battery]
         return Hiding(
             model=self.model,
             effects={name: sized_effect(name, self.size, self.model) for name in self.effects},
@@ -148,23 +147,25 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     floor = truth["noise_floor_rad"]
     named = list(dict.fromkeys(effect["name"] for effect in report["effects"]))
     sets = [list(group) for group in report["ambiguous"]]
-    right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
-    # The name that stands for a hidden effect is right if the report says that it does.
-    stands = {o: name for name, others in equivalent(case.model).items() for o in others}
-    right |= {stands[n] for n in case.effects if n in stands and any(n in group for group in sets)}
-    # So is one that is the same as the hidden ones together, if the report says that.
-    stood_for = {
-        n
-        for group in sets
-        if group[0] in named and len(case.effects) > 1 and {*case.effects} <= {*group[1:]}
-        if {*group[1:]} <= {*TOGETHER.get(group[0], ())}
-        for n in group
-    }
-    right |= stood_for
-    both = SUMS.get(frozenset(case.effects))
-    found = {*named} | stood_for | ({*case.effects} if both in named else set())
-    found |= {n for n in case.effects if stands.get(n) in {*named} & right}
-    tolerated = right | {n for name in case.effects for n in NEIGHBOURS.get(name, ())}
+    hidden = {*case.effects}
+    found = hidden.intersection(named)
+    right = hidden.union(MASS_EFFECTS) if case.change == "mass" else {*hidden}
+    # A name that is the same as several hidden effects together is right if the report says that.
+    for name, *others in sets:
+        together = len(hidden) > 1 and hidden <= {*others} <= {*TOGETHER.get(name, ())}
+        if together and name in named:
+            right |= {name, *others}
+            found |= hidden
+    # So is one that stands for a hidden effect.
+    for name, same in equivalent(case.model).items():
+        meant = hidden.intersection(same)
+        if any(meant.intersection(group) for group in sets):
+            right.add(name)
+        if name in right.intersection(named):
+            found |= meant
+    if SUMS.get(frozenset(hidden)) in named:
+        found |= hidden
+    tolerated = right.union(*(NEIGHBOURS.get(name, ()) for name in hidden))
     held_out = report["held_out"]
     return {
         "case": asdict(case),
@@ -188,24 +189,23 @@ def _parameters(report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dic
     """Relative error and coverage of every parameter of every effect named rightly, joint by joint."""
     rows = []
     for effect in report["effects"]:
-        hidden = truth["effects"].get(effect["name"])
-        if hidden is None or effect["name"] not in EFFECTS:
-            continue
-        for joint, (key, estimate) in itertools.product(
-            effect["joints"], effect["parameters"].items()
-        ):
-            true = hidden["parameters"][key][joint]
-            low, high = estimate["ci95"]
-            if not true or estimate["value"] is None:
-                continue  # a parameter that is not hidden has no relative error
-            rows.append(
-                {
-                    "parameter": f"{effect['name']}.{key}",
-                    "joint": joint,
-                    "error": abs(estimate["value"] / true - 1.0),
-                    "covered": low is not None and high is not None and low <= true <= high,
-                }
-            )
+        name = effect["name"]
+        hidden = truth["effects"].get(name, {"parameters": {}})["parameters"]
+        for key, true_values in hidden.items():
+            estimate = effect["parameters"].get(key, {"value": None})
+            for joint in effect["joints"]:
+                true = true_values[joint]
+                if not true or estimate["value"] is None:
+                    continue  # a parameter that is not hidden has no relative error
+                low, high = estimate["ci95"]
+                rows.append(
+                    {
+                        "parameter": f"{name}.{key}",
+                        "joint": joint,
+                        "error": abs(estimate["value"] / true - 1.0),
+                        "covered": low is not None and high is not None and low <= true <= high,
+                    }
+                )
     return rows
 
 
@@ -216,6 +216,8 @@ def said(result: Mapping[str, Any]) -> str:
 
 
 Results = Sequence[Mapping[str, Any]]
+HEAD = ("| figure | goal | measured | cases | reached |", "|---|---|---|---|---|")
+"""Of the table of :class:`Figure`."""
 
 
 @dataclass(frozen=True)
@@ -250,40 +252,52 @@ class Figure:
 
     def row(self) -> str:
         """A row of a table."""
-        bounds = {">=": self.least, "<=": self.most}
-        goal = ", ".join(
-            f"{sign} {bound:.3g}" for sign, bound in bounds.items() if math.isfinite(bound)
-        )
-        answer = (
-            (f"{self.value:.3f}", "yes" if self.reached else "no") if self.values else ("-", "")
-        )
-        return f"| {self.what} | {goal} | {answer[0]} | {len(self.values)} | {answer[1]} |"
+        goals = []
+        for sign, bound in ((">=", self.least), ("<=", self.most)):
+            if math.isfinite(bound):
+                goals.append(f"{sign} {bound:.3g}")
+        value, reached = "-", ""
+        if self.values:
+            value, reached = f"{self.value:.3f}", "yes" if self.reached else "no"
+        return f"| {self.what} | {', '.join(goals)} | {value} | {len(self.values)} | {reached} |"
 
 
 def figures(results: Results) -> list[Figure]:
     """The goals' figures over all results, failed cases counted against them."""
-    single, none, pair, outside = (
-        [r for r in results if r["case"]["kind"] == kind] for kind in KINDS
-    )
-    single = [r for r in single if "error" in r or (r["gap"] or 0.0) >= CLEAR_GAP]
-    good = [r for r in single if "error" not in r]
-    parameters = [
-        row for r in good if r["case"]["effects"][0] in r["named"] for row in r["parameters"]
-    ]
+    kinds: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in KINDS}
+    for r in results:
+        kinds[r["case"]["kind"]].append(r)
+    single = []
+    good = []
+    parameters = []
+    for r in kinds["single"]:
+        if "error" in r:
+            single.append(r)
+        elif (r["gap"] or 0.0) >= CLEAR_GAP:
+            single.append(r)
+            good.append(r)
+            if r["case"]["effects"][0] in r["named"]:
+                parameters += r["parameters"]
 
     def hits(among: Results, says: Callable[[Mapping[str, Any]], bool]) -> list[bool]:
         return ["error" not in r and says(r) for r in among]
 
     return [
         Figure("first name right", hits(single, _first_right), least=0.95),
-        Figure("two hidden: both named", hits(pair, _all_found), least=0.8),
+        Figure("two hidden: both named", hits(kinds["pair"], _all_found), least=0.8),
         Figure(
             "two hidden: one or both, none wrong",
-            hits(pair, lambda r: bool(r["found"]) and not r["false"]),
+            hits(kinds["pair"], lambda r: bool(r["found"]) and not r["false"]),
             least=0.98,
         ),
-        Figure("nothing hidden: no false name", hits(none, lambda r: not r["false"]), least=0.98),
-        Figure("outside: unknown or neighbours", hits(outside, _unknown_or_near), least=0.9),
+        Figure(
+            "nothing hidden: no false name",
+            hits(kinds["none"], lambda r: not r["false"]),
+            least=0.98,
+        ),
+        Figure(
+            "outside: unknown or neighbours", hits(kinds["outside"], _unknown_or_near), least=0.9
+        ),
         Figure("relative error of parameters", [row["error"] for row in parameters], most=0.1),
         Figure(
             "95 % intervals that cover",
@@ -319,26 +333,5 @@ def _unknown_or_near(result: Mapping[str, Any]) -> bool:
 
 
 def markdown(results: Results) -> str:
-    """The figures as tables: the goals first, then what came of every effect at each size."""
-    lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
-    lines += [figure.row() for figure in figures(results)]
-    lines += [
-        "",
-        "| hidden | size | gap / floor | cases | named | answers |",
-        "|---|---|---|---|---|---|",
-    ]
-    groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
-    for result in results:
-        case = result["case"]
-        if case["kind"] in ("single", "outside"):
-            groups.setdefault((case["effects"][0], case["size"]), []).append(result)
-    for (name, size), group in sorted(groups.items()):
-        good = [r for r in group if "error" not in r]
-        answers = Counter(said(r) if r["named"] or r["sets"] else r["verdict"] for r in good)
-        if failed := len(group) - len(good):
-            answers["failed"] = failed
-        told = "; ".join(f"{count} x {answer}" for answer, count in answers.items())
-        gap = f"{np.median([r['gap'] or 0.0 for r in good]):.1f}" if good else "-"
-        named = sum(name in r["found"] for r in good)
-        lines.append(f"| `{name}` | {size} | {gap} | {len(group)} | {named} | {told} |")
-    return "\n".join(lines) + "\n"
+    """The figures as a table."""
+    return "\n".join([*HEAD, *(figure.row() for figure in figures(results)), ""])
