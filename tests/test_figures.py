@@ -3,13 +3,19 @@
 import importlib.util
 import json
 import re
+import shlex
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 from test_evaluate_trace import compared
 
-from vd.command.versions import code_fingerprint
+from vd.bench.cli import Command, main
+from vd.command.files import write_json
+from vd.command.line import parse
+from vd.command.versions import GAP, code_fingerprint
 from vd.evaluate import suite_run
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.result import Result
@@ -39,12 +45,18 @@ def test_no_figure_stands_outside_of_them(name):
 def test_every_stored_figure_of_a_suite_has_its_command_line():
     for path in sorted(figures.FIGURES.glob("*.yaml")):
         stored = path.with_suffix(".json")
-        if path.stem not in ("tables", "speed"):
+        if path.stem == "tables":
+            continue
+        entries = yaml.safe_load(path.read_text())["lines"]
+        for entry in entries:
+            if "command" in entry:
+                parse(Command, shlex.split(entry["command"])[1:], prog="vd-bench")
+        if "command" not in entries[0]:
             for entry in read_suite(str(path)).lines:
                 for line in entry.lines:
                     suite_run.settings(EvalCfg(), line, "zero", _any_objects(line)).validate()
-            names = {entry.name for entry in read_suite(str(path)).lines}
-            assert {key.split("/")[0] for key in json.loads(stored.read_text())} <= names
+        names = {entry["name"] for entry in entries}
+        assert {key.split("/")[0] for key in json.loads(stored.read_text())} <= names
 
 
 def _any_objects(line):
@@ -98,6 +110,49 @@ def test_what_a_command_wrote_is_stored_and_shown_until_the_code_is_another(fold
         (folder / "x.json").write_text(json.dumps({"a/zero": stored | change}))
         (page,) = figures.tables().values()
         assert figures.STALE in page.splitlines()[4] and figures.STALE_NOTE in page, change
+
+
+def test_a_battery_of_the_gap_goes_on_and_is_of_its_own_code(folder, monkeypatch):
+    """A case that is there is not run again, and what the battery finds stands in the table."""
+    ran = []
+
+    def found(case, folder, device):
+        ran.append(case.name)
+        result = {"case": vars(case), "verdict": "no_gap", "named": []} | NOTHING
+        write_json(folder / f"{case.name}.json", result)
+        return result
+
+    def here(work, cases, finished, **_):
+        for case in cases:
+            finished(case, work(case), "")
+
+    nothing = folder / "x.yaml"
+    line = "vd-bench gap --model servo --kinds none --seeds 1"
+    nothing.write_text(f"title: X\nlines: [{{name: a, command: {line}}}]\n")
+    cell = "{x/a: nothing hidden: no false name/value}"
+    tables = folder / "tables.yaml"
+    tables.write_text(tables.read_text().replace("{x/a/zero: overall/outcomes/success}", cell))
+    monkeypatch.setattr("vd.gap.bench.cases.run_tasks", here)
+    monkeypatch.setattr("vd.gap.bench.battery.run_case", found)
+    monkeypatch.setattr(
+        subprocess,
+        "run",
+        lambda words: subprocess.CompletedProcess(words, main(words[words.index("-m") + 2 :])),
+    )
+    where = ["--out", str(folder / "out"), "--device", "cpu"]
+    for extra in (["--shard", "0/2"], [], []):
+        monkeypatch.setattr("sys.argv", ["figures.py", "run", "x", *where, *extra])
+        assert figures.main() == 0
+    assert len(ran) == len(set(ran)) == 40
+    assert figures.collect("x", folder / "out") == 1
+    (page,) = figures.tables().values()
+    assert "|a|100.0|" in page
+    stored = json.loads((folder / "x.json").read_text())["a"]
+    assert stored["seed"] == 0 and stored["code"] == code_fingerprint(GAP) != code_fingerprint()
+    assert stored["visual-dexterity"] and stored["date"] and stored["command"] == line
+
+
+NOTHING = {"sets": [], "false": [], "found": [], "gap": 1.0, "left": 1.0, "shrunk": None}
 
 
 def test_objects_of_a_figure_are_never_replaced(folder, monkeypatch, capsys):

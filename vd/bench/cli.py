@@ -14,7 +14,19 @@ from vd.command import interrupt
 from vd.command.device import resolve_device
 from vd.command.files import check_file, check_folder, write_json
 from vd.command.line import parse
+from vd.command.versions import GAP, MEASURING, code_fingerprint, installed_versions
 from vd.command.warp_quiet import quiet_warp
+
+PACKAGES = ("visual-dexterity", "newton", "warp-lang")
+"""Packages whose versions stand beside what was measured."""
+
+
+def measured_by(device: str, packages: tuple[str, ...]) -> dict[str, str]:
+    """Device, date, versions, and the fingerprint of ``packages``, the code that measured."""
+    import warp as wp
+
+    stamp = {"device": wp.get_device(device).name, "date": f"{date.today()}"}
+    return stamp | {"code": code_fingerprint(packages)} | installed_versions(PACKAGES)
 
 
 @dataclass(frozen=True)
@@ -43,19 +55,11 @@ class SimCommand:
         if teacher is None:
             raise ValueError(f"--policy {self.policy} has no network; give a teacher")
         quiet_warp()
-        import warp as wp
-
         from vd.bench.sim import measure
-        from vd.command.versions import code_fingerprint
         from vd.envs.cfg import ReorientCfg
 
         rows: list[dict[str, float]] = []
-        measured = {
-            "device": wp.get_device(device).name,
-            "date": f"{date.today()}",
-            "code": code_fingerprint(),
-            "rows": rows,
-        }
+        measured = measured_by(device, MEASURING) | {"rows": rows}
         for envs in self.envs:
             task = ReorientCfg.of(teacher, objects=self.objects, num_envs=envs)
             rows.append(measure(task, device, teacher=teacher))
@@ -104,16 +108,21 @@ class GapCommand:
     runs what is missing in --out and writes the tables."""
     device: str = "cpu"
     """Warp device."""
+    json: Path | None = None
+    """Write the figures to this file as JSON."""
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
         from vd.command.workers import shard
 
         shard((), self.shard)  # before anything slow
+        if self.json is not None:
+            check_file(self.json)
         from vd.command.files import write_text
         from vd.gap.bench.battery import battery, run_battery
-        from vd.gap.bench.score import markdown
+        from vd.gap.bench.score import figures, markdown
 
+        device = resolve_device(self.device)
         cases = battery(
             self.model,
             kinds=self.kinds,
@@ -127,10 +136,15 @@ class GapCommand:
             shard(cases, self.shard),
             self.out,
             jobs=max(self.jobs, 1),
-            device=resolve_device(self.device),
+            device=device,
         )
         if self.shard is not None:
             return 0
+        if self.json is not None:
+            known = [figure for figure in figures(results) if figure.values]
+            row = {f.what: {"value": f.value, "cases": len(f.values)} for f in known}
+            stamp: dict[str, object] = {"seed": self.first_seed, **measured_by(device, GAP)}
+            write_json(self.json, stamp | {"rows": [row]})
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
         return 0

@@ -10,6 +10,8 @@ from pathlib import Path
 
 MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "policy", "evaluate")
 """Packages that decide what an evaluation gives."""
+GAP = ("kernels", "logs", "gap")
+"""Packages that decide what the gap workflow finds."""
 SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py", "store.py")
 """Files in them that only ask and show."""
 
@@ -26,13 +28,13 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
 
 
 @cache
-def code_fingerprint() -> str:
-    """What tells the code that measures from other code: a digest of its statements.
+def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
+    """What tells the code that measures from other code: a digest of its packages' statements.
 
     Comments, docstrings and empty lines do not count, nor does where it is installed.
     """
     digest = hashlib.sha256()
-    for package in MEASURING:
+    for package in packages:
         spec = find_spec(f"vd.{package}")
         assert spec is not None
         assert spec.submodule_search_locations is not None
