@@ -364,7 +364,7 @@ def test_the_largest_motions_touch_nothing(name, request, tmp_path):
             plant.advance(
                 0.01, [Drive(float(angle), motor.p_gain, 8.0, 2.6) for angle, motor in goals]
             )
-            found = plant._solver.mjw_data
+            found = plant.sim.solver.mjw_data
             touching = np.count_nonzero(found.contact.dist.numpy()[: found.nacon.numpy()[0]] < 0.0)
             assert index < 200 or touching == 0, f"{motion.file}: {touching} contacts"
 

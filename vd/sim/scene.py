@@ -69,7 +69,7 @@ class Scene:
     link_body: np.ndarray
     """Body index within a world of every hand link, base first, shape [D + 1]."""
     object_body: int
-    """Body index within a world of the object."""
+    """Body index within a world of the object; -1 where there is none."""
     shape_kind: np.ndarray
     """SHAPE_* of every shape, shape [S]."""
     worlds: list[tuple[newton.ModelBuilder, int]]
@@ -323,7 +323,8 @@ def build_scene(
     hand_builder = build_hand(hand, cfg, visuals=visuals)
     world_object = assign_objects(num_envs, len(objects))
     world_scale = np.ones(num_envs)
-    scene, worlds = new_builder(), []
+    scene = new_builder()
+    worlds = []
     for index, item in enumerate(objects):
         count = int(np.count_nonzero(world_object == index))
         scale_index = assign_objects(count, len(scales))
@@ -343,10 +344,33 @@ def build_scene(
             )
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
-    model = scene.finalize(device=device)
-    bodies = model.body_count // num_envs
+    return _finish(scene, hand, objects, world_object, world_scale, worlds, device)
+
+
+def build_bare_scene(hand: HandModel, cfg: SimCfg, device: str) -> Scene:
+    """One world of a hand without an object."""
+    world = build_hand(hand, cfg, visuals=False)
+    if not hand.palm_up:
+        add_table(world, cfg, visible=False)
+    scene = new_builder()
+    scene.replicate(world, 1)
+    return _finish(scene, hand, [], np.zeros(1, dtype=int), np.ones(1), [(world, 1)], device)
+
+
+def _finish(
+    builder: newton.ModelBuilder,
+    hand: HandModel,
+    objects: Sequence[ObjectModel],
+    world_object: np.ndarray,
+    world_scale: np.ndarray,
+    worlds: list[tuple[newton.ModelBuilder, int]],
+    device: str,
+) -> Scene:
+    """Finalize what was built, and say where things are in it."""
+    model = builder.finalize(device=device)
+    bodies = model.body_count // len(world_object)
     names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
-    object_body = names.index(OBJECT_LABEL)
+    object_body = names.index(OBJECT_LABEL) if objects else -1
     return Scene(
         model=model,
         hand=hand,

@@ -145,7 +145,7 @@ class Simulator:
         wp.copy(self._next_body_force, self.body_force)
         if self.servo is not None:
             self.servo.send(self.target)
-        self._physics_steps()
+        self.physics_steps()
         if self.servo is not None:
             self.servo.measure()
         self._table_contact()
@@ -165,11 +165,8 @@ class Simulator:
             [self.joint_q, self.joint_qd, step_count],
         )
 
-    def _physics_steps(self) -> None:
-        """The physics steps of one control step, with what surrounds them.
-
-        States end where they began.
-        """
+    def physics_steps(self) -> None:
+        """The physics steps of one control step alone; states end where they began."""
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
         there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
