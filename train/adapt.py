@@ -252,7 +252,8 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
-    before, after = str(cfg.policy), policy_at(cfg.out)
+    before = str(cfg.policy)
+    after = policy_at(cfg.out)
     evaluation = EvalCfg(
         policies=(before, after),
         objects=run.env.objects,
@@ -264,7 +265,8 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     for model, layer in ((NOMINAL, NO_LAYER), (IDENTIFIED, str(cfg.hand_layer))):
         results.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
     rows = tuple(row for compared in results for row in compared.rows if row.stopped_by != SUCCESS)
-    result, page = Result(rows, results[0].software), cfg.out / PAGE
+    result = Result(rows, results[0].software)
+    page = cfg.out / PAGE
     rate = {
         (model, policy): percent(row.overall.outcomes["success"])
         for (model, _), headlines in result.headlines().items()

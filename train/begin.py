@@ -189,7 +189,8 @@ def check_fit(
     from vd.policy.contract import PolicySpec
 
     trained = from_dict(PolicySpec, state["policy"], where="policy")
-    hand, here = state["task"].get("hand"), task.get("hand")
+    hand = state["task"].get("hand")
+    here = task.get("hand")
     if trained.num_actions != spec.num_actions:
         raise ValueError(
             f"--init: {path} moves {trained.num_actions} joints of {hand}, and this run's hand, "
@@ -201,7 +202,8 @@ def check_fit(
         where=f"--init: {path}: task.observation",
     )
     for name in ("hidden", "distribution", "normalise_observations"):
-        theirs, ours = getattr(trained, name), getattr(spec, name)
+        theirs = getattr(trained, name)
+        ours = getattr(spec, name)
         if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
             raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {REMEDY}")

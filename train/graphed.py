@@ -28,7 +28,8 @@ class Recorded:
     def __init__(
         self, function: Callable[[], torch.Tensor], parameters: Sequence[nn.Parameter]
     ) -> None:
-        self._function, self._parameters = function, parameters
+        self._function = function
+        self._parameters = parameters
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> torch.Tensor:

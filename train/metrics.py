@@ -30,13 +30,15 @@ class StepMeans:
         """Add one step's scalars; every step has the same keys."""
         values = torch.stack(tuple(log.values()))
         if self._sum is None:
-            self._names, self._sum = tuple(log), torch.zeros_like(values)
+            self._names = tuple(log)
+            self._sum = torch.zeros_like(values)
         self._sum += values
         self._steps += 1
 
     def clear(self) -> None:
         """Forget the steps so far."""
-        self._sum, self._steps = None, 0
+        self._sum = None
+        self._steps = 0
 
     def read(self, world_size: int = 1) -> dict[str, float]:
         """Means by name, averaged over the ranks, and start anew. Waits for the device."""

@@ -70,13 +70,17 @@ class TeacherRunner(TrainingLoop):
         device: str,
     ) -> None:
         super().__init__(run, device=device, env=env)
-        self.ppo, self.policy_cfg, self.task, self.interface = ppo, policy, task, interface or {}
+        self.ppo = ppo
+        self.policy_cfg = policy
+        self.task = task
+        self.interface = interface or {}
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self.failures: ObjectFailures | None = None
         if ppo.failure_floor is not None:
             self.failures = ObjectFailures(env.env.world_object, ppo.failure_floor, device)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
-        self._means, self._window = StepMeans(), self._new_window()
+        self._means = StepMeans()
+        self._window = self._new_window()
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._better = False
@@ -121,7 +125,8 @@ class TeacherRunner(TrainingLoop):
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
         self.critic_warmup = warmup_iterations(state)
-        self._best, self._window = None, self._new_window()
+        self._best = None
+        self._window = self._new_window()
 
     def save(self) -> None:
         """Write checkpoint and policy; the policy is that of the best checkpoint.

@@ -167,7 +167,9 @@ def views_of(
         size_m: Side of the cube [m].
         count: How many.
     """
-    hand, bus, joints = connection.hand, connection.bus, connection.joints
+    hand = connection.hand
+    bus = connection.bus
+    joints = connection.joints
     print(f"Bend finger {finger} all ways, the cube to the camera; hold it still now and then.")
     bent: list[np.ndarray] = []
     views: list[tuple[np.ndarray, np.ndarray]] = []

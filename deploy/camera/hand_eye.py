@@ -157,7 +157,8 @@ def _by_motions(views: Views) -> np.ndarray:
     """
     first, second = np.triu_indices(len(views), 1)
     same = views.finger[first] == views.finger[second]
-    first, second = first[same], second[same]
+    first = first[same]
+    second = second[same]
     in_base = compose(views.tip[first], _inverse(views.tip[second]))
     in_camera = compose(views.cube[first], _inverse(views.cube[second]))
     turns = Rotation.from_quat(in_base[:, 3:])

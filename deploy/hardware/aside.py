@@ -28,7 +28,8 @@ def aside(hand: HandModel, moving: int) -> np.ndarray:
     """
     touching = _Touching(hand)
     joints = np.arange(hand.num_joints)
-    middle, half = 0.5 * (hand.lower + hand.upper), 0.5 * (hand.upper - hand.lower)
+    middle = 0.5 * (hand.lower + hand.upper)
+    half = 0.5 * (hand.upper - hand.lower)
     moves = hand.joint_finger == moving
     swept = []
     for joint in joints[moves]:

@@ -194,7 +194,8 @@ def _surface(path: Path, generator: np.random.Generator) -> Surface:
 
 def _unit(path: Path, longest: float) -> float:
     """Factor from the scan's unit to metres."""
-    low, high = LONGEST_SIDE_M[0] / LARGER, LONGEST_SIDE_M[1] * LARGER
+    low = LONGEST_SIDE_M[0] / LARGER
+    high = LONGEST_SIDE_M[1] * LARGER
     fitting = [UNITS_M[name] for name in GUESSED_UNITS if low <= longest * UNITS_M[name] <= high]
     if not fitting:
         raise GoalError(

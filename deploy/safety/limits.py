@@ -123,7 +123,8 @@ class Limits:
         hand = joints.hand
         self._names = tuple(names)
         self._cfg = cfg
-        self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
+        self.lower = hand.lower + cfg.margin_rad
+        self.upper = hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(
                 f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider"

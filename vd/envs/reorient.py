@@ -97,15 +97,16 @@ class ReorientEnv:
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
         self._launch = state.launch
-        self.hand, self.objects, self.scene, self.sim = (
-            state.hand,
-            state.objects,
-            state.scene,
-            state.sim,
-        )
-        self.fingers, self.parameters = state.fingers, state.parameters
-        self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
-        self.smoothed, self.goal_quat = state.smoothed, state.goal_quat
+        self.hand = state.hand
+        self.objects = state.objects
+        self.scene = state.scene
+        self.sim = state.sim
+        self.fingers = state.fingers
+        self.parameters = state.parameters
+        self.measured_q = state.measured_q
+        self.measured_qd = state.measured_qd
+        self.smoothed = state.smoothed
+        self.goal_quat = state.goal_quat
 
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
@@ -152,7 +153,8 @@ class ReorientEnv:
 
     def _allocate(self) -> None:
         """Arrays of what a step decides, and of its counts."""
-        n, zeros = self.num_envs, self.state.zeros
+        n = self.num_envs
+        zeros = self.state.zeros
         self.action = zeros(n, self.num_actions)
         self.reward = zeros(n)
         self.reward_terms = zeros(n, len(self.reward_term_names))
@@ -182,7 +184,8 @@ class ReorientEnv:
         self.ended = zeros(n, dtype=wp.int32)
         self._new_goal = zeros(n, dtype=wp.int32)
         self._env_mask = zeros(n + 1, dtype=wp.bool)
-        self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
+        self._given_start = zeros(n, dtype=wp.quat)
+        self._given_goal = zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         self._reset_q = wp.array(self.hand.start, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, self.hand.start)
@@ -238,8 +241,10 @@ class ReorientEnv:
             envs: Their numbers, shape [E].
             goal_quat: Goal orientations, xyzw, shape [E, 4].
         """
-        mask, goals = np.zeros(self.num_envs, np.int32), self.goal_quat.numpy()
-        mask[envs], goals[envs] = 1, goal_quat
+        mask = np.zeros(self.num_envs, np.int32)
+        goals = self.goal_quat.numpy()
+        mask[envs] = 1
+        goals[envs] = goal_quat
         self.ended.zero_()
         self._new_goal.assign(mask)
         self._given_goal.assign(goals)
@@ -324,7 +329,8 @@ class ReorientEnv:
         self._graphs.replay(self.sim.step)
 
     def _apply_action(self) -> None:
-        p, sim = self.parameters, self.sim
+        p = self.parameters
+        sim = self.sim
         action = self._actuated.all_joints(self.action)
         if self.symmetry_frames is not None and self.acts_in_frame:
             action = self.symmetry_frames.world_action(action)
@@ -381,7 +387,8 @@ class ReorientEnv:
 
     def _judge(self) -> None:
         """Success and reward of the step, before resets."""
-        p, sim = self.parameters, self.sim
+        p = self.parameters
+        sim = self.sim
         self._launch(
             success_kernel,
             [
@@ -439,7 +446,8 @@ class ReorientEnv:
         self, reset: wp.array, *, use_start: bool = False, use_goal: bool = False
     ) -> None:
         """Reset the environments of ``reset`` [N], give a goal to those of ``_new_goal`` too."""
-        sim, p = self.sim, self.parameters
+        sim = self.sim
+        p = self.parameters
         self._launch(
             reset_kernel,
             [

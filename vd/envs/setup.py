@@ -31,7 +31,8 @@ def table_steps(cfg: ReorientCfg, air: float) -> np.ndarray:
     Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it
     to the policy.
     """
-    table, n = cfg.table, cfg.num_envs
+    table = cfg.table
+    n = cfg.num_envs
     draw = np.random.default_rng(cfg.seed)
     away = draw.permutation(n) < round(air * table.away_share * n)
     steps = np.maximum(1, np.round(draw.uniform(*table.away_s, size=n) * cfg.sim.control_hz))
@@ -56,7 +57,8 @@ def rest_poses(env: Any) -> np.ndarray:
     A drop that left the claw is replaced by one of the same environment that did not, or, if all
     did, by the start. Each is a position [m] and a quaternion xyzw.
     """
-    workspace, dropped = env.hand.workspace, []
+    workspace = env.hand.workspace
+    dropped = []
     for _ in range(env.cfg.start.poses):
         env.reset()
         for _ in range(round(SETTLE_S * env.cfg.sim.control_hz)):

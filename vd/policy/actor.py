@@ -133,7 +133,8 @@ class FunctionPolicy:
     """A function of a user, from observations [N, O] to actions [N, A], tensors of one device."""
 
     def __init__(self, function: Callable[[torch.Tensor], torch.Tensor], num_actions: int) -> None:
-        self._function, self.num_actions = function, num_actions
+        self._function = function
+        self.num_actions = num_actions
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions [N, A].

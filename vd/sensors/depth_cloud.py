@@ -23,8 +23,12 @@ from vd.paper import PAPER
 def make_views(camera: CameraModel, count: int, device: str) -> wp.array:
     """The intrinsics of so many equal cameras."""
     view = View()
-    view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    view.near, view.far = camera.near, camera.far
+    view.fx = camera.fx
+    view.fy = camera.fy
+    view.cx = camera.cx
+    view.cy = camera.cy
+    view.near = camera.near
+    view.far = camera.far
     return wp.array([view] * count, dtype=View, device=device)
 
 

@@ -85,7 +85,9 @@ class JointServo:
         self.num_envs = n = joint_q.shape[0]
         self.num_joints = d = np.shape(rows)[-2] if np.ndim(rows) >= 2 else 0
         self.dt = physics_dt
-        self._solver, self._control, self._joint_q = solver, control, joint_q
+        self._solver = solver
+        self._control = control
+        self._joint_q = joint_q
         self.device = solver.model.device
         expected = np.arange(d)
         dofs = solver.mjc_dof_to_newton_dof.numpy()[0, :d]
@@ -156,7 +158,8 @@ class JointServo:
         Raises:
             ValueError: Names the joint and the parameter that cannot be simulated.
         """
-        n, d = self.num_envs, self.num_joints
+        n = self.num_envs
+        d = self.num_joints
         rows = np.asarray(rows, dtype=np.float32)
         if rows.shape not in ((d, PARAMETER_COLUMNS), (n, d, PARAMETER_COLUMNS)) or d == 0:
             raise ValueError(

@@ -220,7 +220,8 @@ def add_table(
 
 def show_table(builder: newton.ModelBuilder, cfg: SimCfg, body: int = -1) -> None:
     """Add what is seen of the table, a box, to the world or to a body at the world's origin."""
-    size, top = PAPER.scene.table_size_m, PAPER.scene.table_top_m
+    size = PAPER.scene.table_size_m
+    top = PAPER.scene.table_top_m
     builder.add_shape_box(
         body=body,
         xform=wp.transform(wp.vec3(0.0, 0.0, top - 0.5 * size[2]), wp.quat_identity()),

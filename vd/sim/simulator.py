@@ -70,12 +70,14 @@ class Simulator:
             servo_seed: Seed of the random delays and losses of commands.
         """
         cfg.validate()
-        self.scene, self.cfg = scene, cfg
+        self.scene = scene
+        self.cfg = cfg
         self.model = scene.model
         self.device = self.model.device
         self.num_envs = n = scene.num_envs
         self.solver = make_solver(self.model, cfg, scene.worlds)
-        self.state, self._next = self.model.state(), self.model.state()
+        self.state = self.model.state()
+        self._next = self.model.state()
         self.control = self.model.control()
         if self.device.is_cuda:  # a processor has no warps that would wait
             sort_pairs(self.solver.mjw_model, self.solver.mjw_data)
