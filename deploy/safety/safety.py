@@ -269,28 +269,23 @@ class SafeHand:
                 raise self.stop(unheard(error), lost=True) from error
         return goal
 
-    def move(self, goal: np.ndarray, speed: float) -> np.ndarray:
+    def move(self, goal: np.ndarray, speed: float) -> None:
         """Move slowly in a straight line of joint angles, and wait for the hand to follow.
 
         Args:
             goal: Angles of the joints [rad], shape [D].
             speed: Of the joint that has farthest to go [rad/s].
-
-        Returns:
-            The largest distance of each joint from where it should have been [rad], shape [D].
         """
         start = self.read().position
         steps = max(1, math.ceil(float(np.abs(goal - start).max()) / (speed * MOVE_S)))
-        worst = np.zeros(len(start))
         clock = self.bus.clock
         begin = clock.now()
         for step in range(1, steps + SETTLE_STEPS + 1):
             target = start + (goal - start) * min(1.0, step / steps)
             self.command(target)
             clock.sleep(begin + step * MOVE_S - clock.now())
-            worst = np.maximum(worst, np.abs(self.read().position - target))
+            self.read()
             self.beat()
-        return worst
 
     def switch(self, on: np.ndarray) -> None:
         """Switch the torque of joints on or off; one that is switched on stays where it is.

@@ -25,7 +25,6 @@ from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.reached_starts import ReachedStarts
 from vd.envs.saved_state import load_arrays, save_state, saved_levels
-from vd.envs.setup import rest_poses
 from vd.envs.starts import FreeStarts
 from vd.envs.task_state import build_task
 from vd.kernels.rng import init_rng_kernel
@@ -38,6 +37,8 @@ from vd.kernels.task.success import success_kernel
 from vd.sim.graphs import Graphs
 from vd.sim.simulator import CHECKED
 
+SETTLE_S = 1.5
+"""Time an object has to come to rest after a drop [s]; some slim ones still rock then."""
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one
 object in an unlucky start fails in the first step, again whenever the run is started anew, and is
@@ -148,7 +149,7 @@ class ReorientEnv:
         """
         self._own_steps = 0
         if cfg.start.at_rest:
-            self._rest_poses = wp.array(rest_poses(self), dtype=wp.transform, device=self.device)
+            self._rest_poses = wp.array(self._dropped(), dtype=wp.transform, device=self.device)
         self.reset()
 
     def _allocate(self) -> None:
@@ -195,6 +196,30 @@ class ReorientEnv:
         self._actuated = ActuatedActions(self.state)
         self.refused = zeros(n, dtype=wp.int32)
         """Actions that were not finite since that was told, shape [N]."""
+
+    def _dropped(self) -> np.ndarray:
+        """Where objects come to lie that are dropped a few times, shape [N, K, 7].
+
+        A drop that left the claw is replaced by one of the same environment that did not, or, if
+        all did, by the start. Each is a position [m] and a quaternion xyzw.
+        """
+        workspace = self.hand.workspace
+        dropped = []
+        for _ in range(self.cfg.start.poses):
+            self.reset()
+            for _ in range(round(SETTLE_S * self.cfg.sim.control_hz)):
+                wp.copy(self.sim.target, self.sim.joint_q)
+                self.sim.step()
+            self.check()
+            dropped.append(self.object_pose())
+        landed = np.stack(dropped, axis=1)
+        away_m = np.linalg.norm(landed[:, :, :3] - workspace.goal_m, axis=2)
+        inside = away_m < self.cfg.success.fall_of(workspace)
+        # Choose, for every slot, the slot itself or the first good one of the environment.
+        slot = np.where(inside, np.arange(len(dropped)), np.argmax(inside, axis=1)[:, None])
+        poses = np.take_along_axis(landed, slot[:, :, None], axis=1)
+        poses[~inside.any(axis=1)] = [*workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
+        return poses
 
     # Stepping
 

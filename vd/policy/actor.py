@@ -6,7 +6,7 @@ A trained actor, zero or random actions. They need torch only, no simulator and 
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -28,16 +28,6 @@ _NORMALISER_EPSILON = 1e-2
 """Added to the running std by the normaliser that trained the actor (rsl-rl's
 EmpiricalNormalization).
 """
-
-
-class Policy(Protocol):
-    """Anything that acts on observations."""
-
-    num_actions: int
-
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Actions [N, D] in about [-1, 1] for observations [N, O], on the same device."""
-        ...
 
 
 class MeanAction(nn.Module):

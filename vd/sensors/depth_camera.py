@@ -85,12 +85,7 @@ class DepthCamera:
         self.height = camera.height
         self.width = camera.width
         self._cloud = cloud = DepthCloud(
-            camera.height,
-            camera.width,
-            n,
-            points=cfg.points,
-            crop_m=cfg.crop_m,
-            device=device,
+            camera.height, camera.width, n, points=cfg.points, crop_m=cfg.crop_m, device=device
         )
         self.points = cloud.points
         """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape
