@@ -19,7 +19,10 @@ ms.
 
 
 def from_future(time_s: float, now_s: float) -> str:
-    """By how much a time [s] lies ahead of the present, with the remedy; empty where it does not."""
+    """By how much a time [s] lies ahead of the present, with the remedy.
+
+    Empty where it does not.
+    """
     ahead_s = time_s - now_s
     if ahead_s <= AHEAD_S:
         return ""

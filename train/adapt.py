@@ -68,8 +68,8 @@ class AdaptCfg:
     """
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder; by default
-    the installed one of the layer's hand."""
+    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder; by
+    default the installed one of the layer's hand."""
     hand_layer: Path | None = None
     """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap; by default
     gap/identified.usda."""

@@ -42,8 +42,8 @@ COMPACT = 3.0
 """Longest over shortest side, at most, of a mesh that is chosen; of half of our procedural objects
 it is less (their median is 2.9), of flat and long things, of which policies drop most, more."""
 IMPORT = ("--time-limit", "20", "--mcts-iterations", "5")
-"""Processor time of each decomposition [s], and a quarter of the usual search effort: a stapler then
-takes 8 s in place of 29, and its parts are as good."""
+"""Processor time of each decomposition [s], and a quarter of the usual search effort: a stapler
+then takes 8 s in place of 29, and its parts are as good."""
 EPISODES = 3
 """Starts and goals of every object: what two cores simulate in half a minute."""
 FILM_S = 8.0

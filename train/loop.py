@@ -199,7 +199,10 @@ class TrainingLoop:
             torch.distributed.destroy_process_group()
 
     def _row(self) -> dict[str, Any] | None:
-        """One iteration; its row for ``progress.jsonl``, or ``None`` if a signal cut its rollout short."""
+        """One iteration.
+
+        Its row for ``progress.jsonl``, or ``None`` if a signal cut its rollout short.
+        """
         if self.is_distributed:
             watch_iteration()
         start = time.perf_counter()

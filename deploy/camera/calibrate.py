@@ -59,8 +59,8 @@ class CalibrateCfg(HandOptions):
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
     pose_frame: tuple[float, float, float, float, float, float, float] | None = None
-    """Where a twin's camera is, or a real one is thought to be, in the hand's base: position [m] and
-    quaternion xyzw; by default where the hand's file has it."""
+    """Where a twin's camera is, or a real one is thought to be, in the hand's base: position [m]
+    and quaternion xyzw; by default where the hand's file has it."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before the torque goes off."""
 

@@ -60,14 +60,14 @@ class ScoreCfg:
     log: Annotated[Path, tyro.conf.Positional]
     """Folder of the log of vd-deploy."""
     mocap: Path
-    """Export of the motion capture: CSV with time [s], x, y, z [m], qx, qy, qz, qw, and tracked (1 or
-    0) if it likes; empty cells where markers were lost."""
+    """Export of the motion capture: CSV with time [s], x, y, z [m], qx, qy, qz, qw, and tracked (1
+    or 0) if it likes; empty cells where markers were lost."""
     offset_s: float | None = None
     """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop.
     By default times are seconds since 1970."""
     world: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Turn from the motion capture's frame to the hand's world frame (z up), quaternion xyzw; 0.707 0
-    0 0.707 where y points up."""
+    """Turn from the motion capture's frame to the hand's world frame (z up), quaternion xyzw; 0.707
+    0 0 0.707 where y points up."""
     marker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined
     on it.

@@ -69,8 +69,8 @@ class SafetyCfg:
     stale_s: float = 3.0 * PERIOD_S
     """Age [s] of the newest image at which the hand is stopped, once there was one."""
     pose_stale_s: float = 1.0
-    """Age [s] of the newest pose of --pose at which the hand is stopped: for less long the object may
-    be behind a finger, and a tracker of 10 Hz that drops one is 0.35 s old."""
+    """Age [s] of the newest pose of --pose at which the hand is stopped: for less long the object
+    may be behind a finger, and a tracker of 10 Hz that drops one is 0.35 s old."""
     watchdog_s: float = 0.3
     """Silence [s] after which the motors stop by themselves; 0 for never. Above three control
     periods.

@@ -79,7 +79,10 @@ LEFT_ON = "it holds, as --safety.then says"
 
 
 class StoppedError(RuntimeError):
-    """The hand was stopped; the message says why, ``signal`` which one asked for it, 0 for another reason."""
+    """The hand was stopped.
+
+    The message says why, ``signal`` which one asked for it, 0 for another reason.
+    """
 
     def __init__(self, reason: str, number: int = 0):
         super().__init__(reason)
@@ -230,7 +233,10 @@ class SafeHand:
             )
 
     def read(self) -> HandState:
-        """Read the joints; for a short gap in the bus the last state once more, with its own time."""
+        """Read the joints.
+
+        For a short gap in the bus the last state once more, with its own time.
+        """
         self._check()
         try:
             state = self._read()
@@ -445,14 +451,20 @@ class SafeHand:
         self._tell(lambda: self.bus.write_goals(goals))
 
     def _tell(self, send: Callable[[], None]) -> None:
-        """Tell the motors to hold, and note when; a line that takes nothing is told of at the end."""
+        """Tell the motors to hold, and note when.
+
+        A line that takes nothing is told of at the end.
+        """
         assert self.report is not None
         with contextlib.suppress(BusError):
             send()
             self.report = replace(self.report, held_s=self.report.held_s or self.bus.clock.now())
 
     def _off(self) -> None:
-        """Settle where the hand came to rest, then torque off as configured; the first caller does it."""
+        """Settle where the hand came to rest, then torque off as configured.
+
+        The first caller does it.
+        """
         with self._ending:
             if self._ends:
                 return

@@ -90,7 +90,10 @@ class NewtonHand:
             self.sim.servo.reset(wp.ones(1, dtype=wp.int32, device="cpu"))
 
     def place_object(self) -> None:
-        """Put the object, if there is one, where an episode starts, at rest; it falls from there."""
+        """Put the object, if there is one, where an episode starts, at rest.
+
+        It falls from there.
+        """
         if self.scene.objects:
             start = [*self.hand.workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
             self.sim.joint_q.numpy()[0, self._axes :] = start
@@ -132,7 +135,10 @@ class NewtonHand:
         self.sim.solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
 
     def advance(self, seconds: float) -> None:
-        """Go on by ``seconds``; what is less than a pair of physics steps is kept for the next time."""
+        """Go on by ``seconds``.
+
+        What is less than a pair of physics steps is kept for the next time.
+        """
         seconds = min(seconds, LONGEST_S)
         pair_s = self.cfg.control_dt
         while self._rest_s + seconds >= pair_s:

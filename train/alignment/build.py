@@ -28,7 +28,10 @@ from vd.vision.saved import AlignmentSpec
 def build_alignment(
     cfg: AlignmentTrainCfg, *, say: Callable[[str], object] = print
 ) -> AlignTrainer:
-    """Build network, shapes and environments as ``cfg`` says; as :func:`vd.train.stages.build_stage`."""
+    """Build network, shapes and environments as ``cfg`` says.
+
+    As :func:`vd.train.stages.build_stage`.
+    """
     return build_stage(cfg, "alignment", network_of=_network, trainer_of=_trainer, say=say)
 
 

@@ -145,7 +145,9 @@ class FunctionPolicy:
 def read_state(
     path: str | Path, device: str = "cpu", *, remedy: str, wanted: str = CHECKPOINT_FORMAT
 ) -> dict[str, Any]:
-    """What torch saved in a file of the format ``wanted``, its weights whole; executes nothing in it.
+    """What torch saved in a file of the format ``wanted``, its weights whole.
+
+    Executes nothing in it.
 
     Raises:
         FileNotFoundError: There is no such file.
