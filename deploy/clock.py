@@ -44,7 +44,7 @@ class Clock(Protocol):
         """Wait; not at all for less than nothing."""
 
     def every(self, seconds: float, do: Callable[[], None]) -> Callable[[], None]:
-        """Do something again and again, whatever the program does, until what is returned was called."""
+        """Do something again and again, whatever else goes on, until what is returned is called."""
 
     def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
         """Begin what takes long.

@@ -1,4 +1,4 @@
-"""``vd-train adapt``: train a teacher further in an identified model of its hand, and what that is worth."""
+"""``vd-train adapt``: train a teacher further in an identified model of its hand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -246,7 +246,7 @@ def _check_teacher(name: str) -> None:
 
 
 def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
-    """Compare the policy before and after, in the nominal and in the identified model, and write the page."""
+    """Compare the policy before and after, in both models of the hand, and write the page."""
     from vd.evaluate.compare import compare
     from vd.evaluate.page import percent, settings_text, shown_name, write_page
     from vd.evaluate.result import SUCCESS, Result

@@ -79,7 +79,7 @@ def read_start(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
-    """Settings with which a run goes on as what it begins from was trained, where no preset is asked for.
+    """Settings of the training of what a run begins from, for one that asks for no preset.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -110,7 +110,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
 
 
 def warmup_iterations(state: Mapping[str, Any]) -> int:
-    """Iterations in which the critic has to learn alone after a begin from a checkpoint or policy."""
+    """Iterations in which the critic has to learn alone after a begin from another run."""
     if "critic_state_dict" not in state:
         return CRITIC_WARMUP
     if "optimizer_state_dict" not in state:
@@ -215,7 +215,7 @@ def check_fit(
 
 
 def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
-    """Settings that change what observations and actions mean to a policy, each with what it was and is.
+    """Settings that change what observations and actions mean, each with what it was and is.
 
     Such as ``env.observation.view goal, here world``. A run may want them changed; so they are no
     errors. What is younger than the policy's file counts as it is by default, as it does where the

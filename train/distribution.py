@@ -1,4 +1,4 @@
-"""Gaussians of actions that are sampled without a wait for the device, one of them with a bounded std."""
+"""Gaussians of actions that are sampled without a wait for the device."""
 
 import math
 

@@ -216,7 +216,7 @@ def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) 
 
 
 def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
-    """The dataclass ``kind``, of which help does not show the fields ``hidden``, named by dotted path."""
+    """The dataclass ``kind``, of which help does not show the fields ``hidden``, dotted paths."""
     shown: dict[str, Any] = {}
     suppressed: Any = tyro.conf.Suppress
     hints = get_type_hints(kind)
@@ -260,6 +260,6 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
 
 
 def write_config(cfg: "TeacherCfg | AlignmentTrainCfg | StudentTrainCfg") -> None:
-    """Save the resolved configuration in the run's folder, as ``--resume`` takes it, on any machine."""
+    """Save the resolved configuration in the run's folder, for ``--resume`` on any machine."""
     run = replace(cfg.run, device="auto")
     write_json(cfg.run.out / CONFIG_NAME, to_dict(replace(cfg, resume=None, run=run)))

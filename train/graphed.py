@@ -13,7 +13,7 @@ need.
 
 
 class Recorded:
-    """A function that computes gradients, recorded at its first call and replayed from a CUDA graph.
+    """A function that computes gradients, recorded at its first call and then replayed.
 
     A graph repeats launches with the addresses that it was recorded with, so the function has to
     read inputs and weights that stay where they are, has to change nothing but the gradients, and

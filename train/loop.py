@@ -282,7 +282,7 @@ class TrainingLoop:
         return {"format": CHECKPOINT_FORMAT} | self._shared_state() | counters | {"ranks": ranks}
 
     def _restore(self, state: dict[str, Any]) -> None:
-        """Take over counters, environments and random state, all but the first only if they fit this run."""
+        """Take over counters, and environments and random state if they fit this run."""
         self.iteration = state["iter"]
         self.env_steps = state["env_steps"]
         self._elapsed_s = state["elapsed_s"]

@@ -1,4 +1,4 @@
-"""What a run reports: sums on the device, read once an iteration, as JSON lines and in TensorBoard."""
+"""What a run reports once an iteration, as JSON lines and in TensorBoard."""
 
 import json
 import math
@@ -19,7 +19,7 @@ BOARD_FOLDER = "tensorboard"
 
 
 class StepMeans:
-    """Means of ``extras["log"]`` over an iteration's steps, without a copy to the host before the end."""
+    """Means of ``extras["log"]`` over an iteration's steps, copied to the host at its end."""
 
     def __init__(self) -> None:
         self._names: tuple[str, ...] = ()
@@ -107,7 +107,7 @@ class GoalWindow:
 
 
 class ProgressFile:
-    """One JSON object per iteration in ``progress.jsonl``, and the same numbers for ``logger`` (``RunCfg``).
+    """One JSON object an iteration in ``progress.jsonl``, and the same for ``logger`` (``RunCfg``).
 
     Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones
     anew.

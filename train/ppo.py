@@ -42,7 +42,7 @@ first.
 
 
 class TeacherPPO(PPO):
-    """PPO with two learning rates, an unclipped value loss and one gradient norm for actor and critic.
+    """PPO with two learning rates, an unclipped value loss and one gradient norm for both networks.
 
     What differs from rsl-rl's PPO, and why:
 
@@ -137,7 +137,7 @@ class TeacherPPO(PPO):
         self.optimizer.param_groups[CRITIC_GROUP]["lr"] = critic
 
     def update(self) -> dict[str, float]:
-        """Run all epochs over the rollout, or those until the adaptive schedule sees the actor run away.
+        """Run all epochs over the rollout, or those until the actor runs away.
 
         Returns:
             Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl``
@@ -294,7 +294,7 @@ class TeacherPPO(PPO):
         return float(kl)
 
     def _adapt_learning_rate(self, divergence: float) -> None:
-        """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""
+        """Move the actor's learning rate towards updates whose KL divergence is ``desired_kl``."""
         if divergence > self.desired_kl * KL_BAND:
             self.learning_rate = max(MIN_LEARNING_RATE, self.learning_rate / KL_STEP)
         elif 0.0 < divergence < self.desired_kl / KL_BAND:

@@ -107,7 +107,7 @@ class TeacherRunner(TrainingLoop):
         self._take(load_checkpoint(Path(path), self.device), path)
 
     def begin_from(self, path: str | Path, levels: tuple[float, ...] | None = None) -> None:
-        """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
+        """Begin with networks, optimiser, curriculum and counters of another run.
 
         Environments, random states, learning rates and the choice of the best checkpoint are this
         run's own, and so are a critic and an optimiser that the file lacks; then the critic learns

@@ -34,7 +34,7 @@ BUILDING = "building the environments (the first start compiles the kernels: a m
 
 
 def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "TeacherRunner":
-    """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
+    """Build environment and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     ``say`` is told when the slow part begins.
 

@@ -158,7 +158,7 @@ def _let_go(connection: Connection, *, yes: bool) -> None:
 def views_of(
     connection: Connection, camera: "ImageSource", finger: int, size_m: float, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Poses of a fingertip in the hand's base [7], and of the cube in the camera [7], while it bends.
+    """While a finger bends, poses of its tip in the hand's base [7] and of the cube in the camera [7].
 
     Args:
         connection: The hand.

@@ -1,4 +1,4 @@
-"""Where a camera is, from a cube of tags on fingers of a hand that it looks at (hand-eye calibration).
+"""Where a camera is, from a cube of tags on a hand that it looks at (hand-eye calibration).
 
 With the fingertip's pose t_i in the hand's base (forward kinematics), the cube fixed to it at M,
 and the wanted pose X of the camera in the base, view i shows the cube at ``C_i = X^-1 t_i M``. From
@@ -99,7 +99,7 @@ class HandEye:
         return self.factor * np.sqrt(np.diag(self.covariance))
 
     def point_error(self, point: np.ndarray) -> float:
-        """Half of the 95 % interval of where the camera puts a point of the base [3], in the worst direction.
+        """Half of the 95 % interval of where the camera puts a point [3], in the worst direction.
 
         Metres.
         """

@@ -1,4 +1,4 @@
-"""Control tables of DYNAMIXEL X motors (ROBOTIS e-manual, one page a model), as typed data, and their units.
+"""Control tables of DYNAMIXEL X motors (ROBOTIS e-manual, one page a model), and their units.
 
 The models share addresses and differ in units and limits. Angles in radians with zero in the middle
 of the range, velocities in rad/s, currents in A.

@@ -1,4 +1,4 @@
-"""What to reach: the shape of an object, from its USD or any scan, and the orientations it shall take.
+"""What to reach: an object's shape, from its USD or any scan, and orientations for it.
 
 A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface
 is laid through it, by which a tracking policy finds the object; it need not be closed before, as

@@ -139,7 +139,7 @@ class Limits:
         self._weak = Lasting(cfg.current_s)
 
     def goal(self, target: np.ndarray, here: np.ndarray) -> np.ndarray:
-        """The goal in range nearest to the target, but never far from where the joints are, all [D].
+        """The goal in range nearest to the target, but never far from the joints, all [D].
 
         A joint that is out of its range is brought back by steps.
         """

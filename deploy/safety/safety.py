@@ -386,7 +386,7 @@ class SafeHand:
             )
 
     def _errors(self, which: np.ndarray, otherwise: str) -> str:
-        """What some motors [D] bool report as their errors, and what is said of one that reports none."""
+        """What some motors [D] bool report as their errors, and otherwise what is said of them."""
         try:
             errors = self.bus.hardware_errors()
         except BusError:

@@ -40,7 +40,7 @@ class NewtonHand:
     """
 
     def __init__(self, hand: HandModel, cfg: SimCfg | None = None, item: ObjectModel | None = None):
-        """Build the world, with the hand in the task's reset pose and the object above the table."""
+        """Build the world, with the hand in the task's reset pose, the object above the table."""
         self.hand = hand
         cfg = cfg or SimCfg()
         self.cfg = cfg = replace(
@@ -72,12 +72,12 @@ class NewtonHand:
 
     @property
     def joint_q(self) -> np.ndarray:
-        """Hand joints [rad] and, with an object, its position [m] and quaternion xyzw, [D] or [D + 7]."""
+        """Hand joints [rad], and position [m] and quaternion xyzw of an object, [D] or [D + 7]."""
         return np.array(self.sim.joint_q.numpy()[0])
 
     @property
     def joint_qd(self) -> np.ndarray:
-        """Their velocities: joints [rad/s], object linear [m/s] and angular [rad/s], [D] or [D + 6]."""
+        """Velocities: joints [rad/s], object linear [m/s] and angular [rad/s], [D] or [D + 6]."""
         return np.array(self.sim.joint_qd.numpy()[0])
 
     def _begin(self) -> None:

@@ -81,7 +81,7 @@ class Scenes:
 
 
 def alignment_losses(residual: Residual, pairs: Pairs) -> tuple[dict[str, Tensor], Tensor]:
-    """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
+    """Losses by name, means over the batch, and errors of the rotations [rad] [B]."""
     wrong = residual.rotation.detach().mT @ pairs.rotation
     error = turn_angle(wrong)
     losses = {

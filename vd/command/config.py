@@ -1,4 +1,4 @@
-"""Typed configurations to and from plain dictionaries (JSON, checkpoints), checked field by field."""
+"""Typed configurations to and from plain dictionaries, checked field by field."""
 
 import dataclasses
 import difflib
@@ -78,7 +78,7 @@ def needed(cls: type) -> set[str]:
 
 
 def _meant(name: str, names: set[str], hints: Mapping[str, Any]) -> str:
-    """Asks for the field that ``name`` is likely meant to be, one of a group or one that is spelled alike."""
+    """Asks for the field that ``name`` may mean, one of a group or one that is spelled alike."""
     for group in sorted(names):
         kind = hints[group]
         if dataclasses.is_dataclass(kind) and name in {f.name for f in dataclasses.fields(kind)}:
@@ -163,7 +163,7 @@ def _convert_union(options: tuple[Any, ...], value: Any, where: str, over: Any) 
 
 
 def leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Plain values of nested dictionaries and lists by their path, such as ``hand.upper_rad[3]``."""
+    """Plain values of nested dictionaries and lists by path, such as ``hand.upper_rad[3]``."""
     if isinstance(values, Mapping):
         for key, item in values.items():
             yield from leaves(item, f"{where}.{key}" if where else str(key))

@@ -83,7 +83,7 @@ class SeenState:
         self._state.launch(record_state_kernel, [*self._model, now], [self.head, self._ring])
 
     def begin(self, mask: wp.array) -> None:
-        """Draw the latencies of the environments of ``mask`` [N], whose past is their present state."""
+        """Draw the latencies of the environments of ``mask`` [N]; their past is their present state."""
         if not self.is_late:
             return
         state = self._state

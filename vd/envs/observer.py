@@ -78,7 +78,7 @@ class Observer:
             ]
 
     def split(self, values: wp.array) -> tuple[wp.array, wp.array]:
-        """What the actor reads [N, O], and what the critic reads besides [N, A - O], of everything [N, A]."""
+        """What the actor reads [N, O], and the critic besides [N, A - O], of everything [N, A]."""
         count = self.num_observations
         width = values.shape[1]
         if count == width:

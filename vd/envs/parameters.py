@@ -83,7 +83,7 @@ class TaskParameters:
         self.set_levels(Levels())
 
     def blended(self, nominal: Any, drawn: Any, dtype: Any) -> wp.array:
-        """Numbers that the level of physics takes from ``nominal`` to ``drawn``, of any like shapes.
+        """Numbers that the level of physics takes from ``nominal`` to ``drawn``, of like shapes.
 
         Returns:
             Their array on the device. It is written anew with every level.

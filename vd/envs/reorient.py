@@ -47,7 +47,7 @@ no rate.
 
 
 class ReorientEnv:
-    """N environments, each with a hand (F fingers, D joints, A of them actuated) and an object to reorient.
+    """N environments of a hand (F fingers, D joints, A of them actuated) and an object to reorient.
 
     Objects are over a table, but rest in a hand whose palm looks up, and then there is none.
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
@@ -521,7 +521,7 @@ class ReorientEnv:
     # Reading
 
     def has_table(self) -> np.ndarray:
-        """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
+        """Whether each table was there in the last step, bool, shape [N] (host copy)."""
         if self.hand.palm_up:
             return np.zeros(self.num_envs, bool)
         return np.asarray(self.step_count.numpy() <= self.parameters.table_steps.numpy())
@@ -556,7 +556,7 @@ class ReorientEnv:
         self.sim.check(FAILURES_AT_FIRST + expected if rate > 0.0 else 0.0)
 
     def failed_steps(self) -> int:
-        """Steps of environments that failed and were put back (:attr:`ReorientCfg.failures_per_million`)."""
+        """Steps of environments that failed and were put back (``failures_per_million``)."""
         return int(self.sim.failures.numpy().sum())
 
     # Curriculum and checkpoints

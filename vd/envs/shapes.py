@@ -48,7 +48,7 @@ class ShapeObserver:
         self._extent_dim = len(world_object), ORIENTATIONS, len(self._directions)
 
     def measure_clearance(self, joint_q: wp.array, column: int, out: wp.array) -> None:
-        """Write the heights of the objects' lowest points above the table [m] into ``out``, shape [N].
+        """Write heights of the objects' lowest points above the table [m] into ``out``, shape [N].
 
         Args:
             joint_q: Coordinates, shape [N, *].

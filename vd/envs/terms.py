@@ -58,7 +58,7 @@ class OwnTerms:
 
     @torch.no_grad()
     def observe(self, env: Any) -> None:
-        """Write own values of the present state into the observation, as they are in every frame."""
+        """Write own values of the present state into the observation, alike in every frame."""
         observer = env.observer
         first = {part: columns.start for part, columns in observer.parts.items()}
         for name, size in self._sizes.items():

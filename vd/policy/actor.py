@@ -31,7 +31,7 @@ EmpiricalNormalization).
 
 
 class MeanAction(nn.Module):
-    """Normalisation of observations, if it belongs to the actor, its perceptron, and the mean it gives."""
+    """An actor's perceptron, its normalisation of observations if it has one, and its mean."""
 
     def __init__(self, spec: PolicySpec, weights: dict[str, torch.Tensor]) -> None:
         super().__init__()
@@ -229,7 +229,7 @@ def stage_of(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:
-    """The multilayer perceptron with the layer names rsl-rl gives it, ELU between them as in the paper."""
+    """The multilayer perceptron with rsl-rl's names of layers, ELU between them as in the paper."""
     outputs = spec.num_actions * (2 if spec.distribution == "state-dependent" else 1)
     layers: list[nn.Module] = []
     width = spec.num_observations

@@ -33,7 +33,7 @@ def make_views(camera: CameraModel, count: int, device: str) -> wp.array:
 
 
 class DepthCloud:
-    """Crops N depth images by height over the table and chooses K points of each, in the base's frame."""
+    """Crops N depth images by height over the table, and chooses K points of each in the base."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class DepthCloud:
         crop_m: tuple[float, float] = PAPER.camera.crop_m,
         device: str = "cpu",
     ):
-        """Allocate N clouds of at most K ``points`` with heights in the world frame within ``crop_m`` [m]."""
+        """Allocate N clouds of at most K ``points``, of world heights within ``crop_m`` [m]."""
         self.crop_m = crop_m
         self._tile_rows = math.ceil(height / int(TILE_ROWS))
         self._tile_columns = math.ceil(width / int(TILE_COLUMNS))

@@ -159,7 +159,7 @@ class Simulator:
         )
 
     def put_back(self, step_count: wp.array, last_step: int) -> None:
-        """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
+        """Put worlds of which this step failed back to its begin (:func:`put_back_kernel`)."""
         launch(
             put_back_kernel,
             self.num_envs,
@@ -224,7 +224,7 @@ class Simulator:
         self.place_tables(counts, wp.full(n, int(present), dtype=wp.int32, device=self.device))
 
     def place_tables(self, step_count: wp.array, last_step: wp.array) -> None:
-        """Put each world's table where it belongs until its last step, then out of reach of everything.
+        """Put each world's table where it belongs until its last step, then out of reach.
 
         The solver computes where fixed shapes are once, when it is built, so this is written into
         its data, where a captured step finds it. Device work only.
@@ -245,7 +245,7 @@ class Simulator:
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
     def check(self, tolerated: float = 0.0) -> None:
-        """Raise if a step lost contacts, or if more steps failed than are tolerated (two host reads).
+        """Raise if a step lost contacts, or more steps failed than are tolerated (two host reads).
 
         Args:
             tolerated: Control steps of worlds that may have left the finite numbers or been too
