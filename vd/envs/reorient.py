@@ -13,13 +13,7 @@ import warp as wp
 
 from vd.command.device import warp_device
 from vd.envs.cfg import ReorientCfg
-from vd.envs.curriculum import (
-    Levels,
-    first_levels,
-    moving_levels,
-    next_levels,
-    progress_of,
-)
+from vd.envs.curriculum import Levels, moving_levels, next_levels
 from vd.envs.followers import ActuatedActions
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
@@ -141,7 +135,7 @@ class ReorientEnv:
         self._moving = moving_levels(cfg)
         self.levels = Levels()
         """How hard the task is at present; all ones is the configured task."""
-        self.set_levels(first_levels(self._moving))
+        self.set_levels(Levels(**dict.fromkeys(self._moving, 0.0)))
         self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
         """Control steps of all environments since the begin of the run, with those of a
@@ -585,7 +579,9 @@ class ReorientEnv:
     @property
     def progress(self) -> float:
         """How far all levels that move have come together, in [0, 1]; 1: the configured task."""
-        return progress_of(self.levels, self._moving)
+        if not self._moving:
+            return 1.0
+        return sum(getattr(self.levels, name) for name in self._moving) / len(self._moving)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly, see :func:`vd.envs.saved_state.save_state`."""
