@@ -191,13 +191,12 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     """
     assert cfg.policy is not None and cfg.hand_layer is not None
     check_names([cfg.policy], cfg.objects)
-    _check_teacher(cfg.policy)
     try:
         base = settings_of(cfg.policy, PRESETS["gpu"]())
     except ValueError as error:
         raise ValueError(
-            f"{cfg.policy} cannot go on by itself ({error}): vd-train teacher --init {cfg.policy} "
-            f"--hand-layer {cfg.hand_layer} --preset ..."
+            f"{error}; adapt goes on with settings of a teacher's own; with others: vd-train teacher "
+            f"--init POLICY --hand-layer {cfg.hand_layer} --preset ..."
         ) from error
     from vd.assets_usd.hands import load_hand
 
@@ -227,22 +226,6 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     if there is not None and (there.init, there.env) != (run.init, run.env):
         raise FileExistsError(f"{cfg.out} holds a run of other settings; choose another --out")
     return run
-
-
-def _check_teacher(name: str) -> None:
-    """Refuse what sees by camera: its teacher learns, and sees again afterwards."""
-    from vd.policy.actor import TrainedPolicy
-    from vd.policy.agents import open_policy
-
-    policy = open_policy(name, "cpu")
-    if policy is None:
-        raise ValueError(f"{name} has learned nothing; name a trained teacher")
-    if not isinstance(policy, TrainedPolicy):
-        network = f" --alignment {name}" if policy.kind == "vision" else ""
-        raise ValueError(
-            f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see "
-            f"again: vd-train tracker runs/adapted --objects SET{network}"
-        )
 
 
 def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
