@@ -16,21 +16,8 @@ from vd.envs.curriculum import blend
 from vd.policy.actor import teacher_in
 from vd.policy.bundle import write_policy
 from vd.policy.contract import PolicySpec
-from vd.train.begin import (
-    check_fit,
-    completed,
-    read_start,
-    unlike,
-    warmup_iterations,
-    with_fitting_critic,
-)
-from vd.train.checkpoint import (
-    BEST_NAME,
-    POLICY_NAME,
-    load_checkpoint,
-    save_checkpoint,
-    without_worlds,
-)
+from vd.train.begin import check_fit, first_levels, read_start, take_critic, unlike
+from vd.train.checkpoint import BEST_NAME, POLICY_NAME, load_checkpoint, save_checkpoint
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.failures import ObjectFailures
 from vd.train.loop import TrainingLoop, check_update
@@ -119,14 +106,17 @@ class TeacherRunner(TrainingLoop):
         state = read_start(Path(path), self.device)
         check_fit(state, self._spec(), self.task, path)
         self.unlike = unlike(state["task"], self.task)
-        fresh = self.alg.save() | {"window": self._window.state_dict()}
-        state = with_fitting_critic(state, fresh["critic_state_dict"])
-        self._take(without_worlds(completed(state, fresh, levels)), path)
+        stage = first_levels(state, levels)
+        self.alg.actor.load_state_dict(state["actor_state_dict"])
+        self.critic_warmup = take_critic(self.alg, state)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
+        if self.failures is not None and "failures" in state:
+            self.failures.load_state_dict(state["failures"])
+        self.iteration = state["iter"]
+        self.env_steps = state["env_steps"]
+        self._elapsed_s = state.get("elapsed_s", 0.0)
+        self.env.start_anew({"levels": stage})
         self.begun = True
-        self.critic_warmup = warmup_iterations(state)
-        self._best = None
-        self._window = self._new_window()
 
     def save(self) -> None:
         """Write checkpoint and policy; the policy is that of the best checkpoint.
