@@ -16,7 +16,7 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.sim.cfg import SimCfg
 from vd.sim.graphs import Graphs
 from vd.sim.joint_servo import has_effects
-from vd.sim.scene import build_bare_scene, build_scene
+from vd.sim.scene import build_scene
 from vd.sim.simulator import Simulator
 
 LONGEST_S = 0.3
@@ -49,10 +49,8 @@ class NewtonHand:
             nconmax=ROOM * cfg.nconmax,
             njmax=ROOM * cfg.njmax,
         )
-        if item is None:
-            self.scene = build_bare_scene(hand, cfg, "cpu")
-        else:
-            self.scene = build_scene(hand=hand, objects=[item], num_envs=1, cfg=cfg, device="cpu")
+        objects = [] if item is None else [item]
+        self.scene = build_scene(hand=hand, objects=objects, num_envs=1, cfg=cfg, device="cpu")
         rows = hand.servo if has_effects(hand.servo) else None
         self.sim = Simulator(self.scene, cfg, servo_rows=rows)
         self._graphs = Graphs("cpu")

@@ -303,7 +303,7 @@ def build_scene(
 
     Args:
         hand: The hand, read from USD (path and fingertip kind are taken from it).
-        objects: Objects, spread over the worlds.
+        objects: Objects, spread over the worlds; none of a hand alone.
         num_envs: N.
         cfg: Physics settings.
         device: Warp device.
@@ -311,22 +311,21 @@ def build_scene(
         visuals: Include visual shapes.
 
     Raises:
-        ValueError: If there is no object, or fewer worlds than objects.
+        ValueError: There are fewer worlds than objects.
     """
     cfg.validate()
-    if not objects:
-        raise ValueError("no objects to simulate; name a set with --objects (vd-assets makes them)")
     if num_envs < len(objects):
         raise ValueError(
             f"num_envs = {num_envs} is fewer than the {len(objects)} objects; "
             "raise num_envs or name fewer objects"
         )
     hand_builder = build_hand(hand, cfg, visuals=visuals)
-    world_object = assign_objects(num_envs, len(objects))
+    items: list[ObjectModel | None] = list(objects) or [None]
+    world_object = assign_objects(num_envs, len(items))
     world_scale = np.ones(num_envs)
     scene = new_builder()
     worlds = []
-    for index, item in enumerate(objects):
+    for index, item in enumerate(items):
         count = int(np.count_nonzero(world_object == index))
         scale_index = assign_objects(count, len(scales))
         world_scale[world_object == index] = np.asarray(scales)[scale_index]
@@ -336,40 +335,16 @@ def build_scene(
                 continue
             world = new_builder()
             world.add_builder(hand_builder)
-            if (
-                not hand.palm_up
-            ):  # what rests in a hand needs no table, and what falls from it is lost
+            # What rests in a hand needs no table, and what falls from it is lost.
+            if not hand.palm_up:
                 add_table(world, cfg, visible=visuals, item=item)
-            add_object(
-                world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals
-            )
+            if item is not None:
+                drop_m = hand.workspace.drop_m
+                add_object(world, item, cfg, at=drop_m, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
-    return _finish(scene, hand, objects, world_object, world_scale, worlds, device)
-
-
-def build_bare_scene(hand: HandModel, cfg: SimCfg, device: str) -> Scene:
-    """One world of a hand without an object."""
-    world = build_hand(hand, cfg, visuals=False)
-    if not hand.palm_up:
-        add_table(world, cfg, visible=False)
-    scene = new_builder()
-    scene.replicate(world, 1)
-    return _finish(scene, hand, [], np.zeros(1, dtype=int), np.ones(1), [(world, 1)], device)
-
-
-def _finish(
-    builder: newton.ModelBuilder,
-    hand: HandModel,
-    objects: Sequence[ObjectModel],
-    world_object: np.ndarray,
-    world_scale: np.ndarray,
-    worlds: list[tuple[newton.ModelBuilder, int]],
-    device: str,
-) -> Scene:
-    """Finalize what was built, and say where things are in it."""
-    model = builder.finalize(device=device)
-    bodies = model.body_count // len(world_object)
+    model = scene.finalize(device=device)
+    bodies = model.body_count // num_envs
     names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
     object_body = names.index(OBJECT_LABEL) if objects else -1
     return Scene(
