@@ -8,7 +8,7 @@ import termios
 
 
 def attended() -> bool:
-    """Whether a person can answer: there is a terminal, and this program is not in its background."""
+    """Whether a person can answer: at a terminal, with this program not in its background."""
     if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
         return False
     with contextlib.suppress(OSError):  # a terminal without job control

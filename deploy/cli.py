@@ -23,8 +23,8 @@ COMMANDS = {
     "tags": ("pose.tag_sheet", "print a cube of tags, by which --pose tags sees it"),
     "score": ("loop.score", "the object's error at each stop, by motion capture"),
 }
-"""Module of each command and what it does. A module has a function of the command's name, which takes
-options as it is annotated, and returns a status."""
+"""Module of each command and what it does. A module has a function of the command's name, which
+takes options as it is annotated, and returns a status."""
 USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
        vd-deploy COMMAND [flags]
 

@@ -19,7 +19,10 @@ ms.
 
 
 def from_future(time_s: float, now_s: float) -> str:
-    """By how much a time [s] lies ahead of the present, with the remedy; empty where it does not."""
+    """By how much a time [s] lies ahead of the present, with the remedy.
+
+    Empty where it does not.
+    """
     ahead_s = time_s - now_s
     if ahead_s <= AHEAD_S:
         return ""
@@ -41,7 +44,7 @@ class Clock(Protocol):
         """Wait; not at all for less than nothing."""
 
     def every(self, seconds: float, do: Callable[[], None]) -> Callable[[], None]:
-        """Do something again and again, whatever the program does, until what is returned was called."""
+        """Do something again and again, whatever else goes on, until what is returned is called."""
 
     def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
         """Begin what takes long.

@@ -15,7 +15,7 @@ takes.
 
 @contextlib.contextmanager
 def undisturbed(before_all: bool) -> Iterator[bool]:
-    """Run without the garbage collector, without long turns of other threads, and before other programs.
+    """Run without the garbage collector and long turns of other threads, before other programs.
 
     The collector pauses for a second where there is much; a run makes little. A thread that waits
     for the

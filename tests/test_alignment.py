@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.geometry.quaternions import relative_rotation, rotation_distance
-from vd.train.alignment.align import AlignTrainer, Scenes, alignment_losses
+from vd.train.alignment.align import CLOUDS, AlignTrainer, alignment_losses
 from vd.train.alignment.config import AlignCfg
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
+from vd.train.student.bank import ShapeBank, centred_points
+from vd.train.student.shapes import made_shapes
 from vd.train.student.views import Hands
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
 from vd.vision.cfg import AlignmentCfg
@@ -213,7 +215,13 @@ def scenes():
 def make_quick_scenes():
     torch.manual_seed(0)
     hands = Hands(load_hand("dclaw3"), QUICK.hands, device="cpu")
-    return Scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
+    points = CLOUDS * QUICK.points
+    held_out = {
+        "made": made_shapes(4, points, hands.eye.device),
+        "validation": centred_points(load_set(["cuboid"]), points, hands.eye.device),
+    }
+    bank = ShapeBank(load_set(["cube", "cuboid"]), QUICK.shapes, points, hands.eye.device)
+    return bank, held_out, hands
 
 
 def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=None):
@@ -221,7 +229,7 @@ def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_
     scenes = make_quick_scenes() if scenes is None else scenes
     torch.manual_seed(seed)
     return AlignTrainer(
-        scenes,
+        *scenes,
         AlignmentNetwork(cfg.network),
         cfg,
         RunCfg(out=out, device="cpu", save_every=1, logger="none", max_steps=steps),
@@ -283,7 +291,7 @@ def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
 
 
 def test_shapes_are_renewed_from_the_oldest(scenes):
-    bank = scenes.bank
+    bank, *_ = scenes
     before = bank._shapes.clone()
     bank.renew(3)
     bank.renew(4)

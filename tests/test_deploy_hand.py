@@ -165,6 +165,6 @@ def test_the_recorded_steps_are_the_solvers(hand):
         stepped.advance(0.0, drives(joints, goal))
         stepped._hold(goal)
         stepped._two_steps()
-        contacts.append(int(stepped._solver.mjw_data.nacon.numpy()[0]))
+        contacts.append(int(stepped.sim.solver.mjw_data.nacon.numpy()[0]))
         np.testing.assert_array_equal(recorded.joint_q, stepped.joint_q)
     assert contacts[0] == 0 < max(contacts)

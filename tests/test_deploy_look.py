@@ -15,7 +15,7 @@ from vd.assets_usd.camera_layer import read_camera, write_camera_layer
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.deploy.loop.policy_runner import load_runner, seen_points
+from vd.deploy.loop.policy_runner import load_runner
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.agents import open_policy, task_for
@@ -72,7 +72,7 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     image = np.full((36, 64), 0.6, dtype=np.float32)
 
     def middle():
-        points = seen_points(runner.eye, image).numpy()[0]
+        points = runner.eye.seen(image).numpy()[0]
         return points[np.isfinite(points).all(axis=1)]
 
     runner.look_by(LENS.seen_from(runner.camera))

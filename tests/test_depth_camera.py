@@ -247,11 +247,11 @@ def test_a_real_cameras_image_makes_the_same_cloud(device, scenes):
     simulated = make(scene, state)
     simulated.capture()
     real = CameraCloud(scene.hand.camera, scene.hand.mount, device=device)
-    points, count = real.make(host(simulated.depth)[0])
-    assert host(count)[0] == host(simulated.count)[0]
+    points = real.seen(host(simulated.depth)[0])
+    assert host(real.cloud.count)[0] == host(simulated.count)[0]
     np.testing.assert_allclose(host(points)[0], host(simulated.points)[0], atol=1e-6)
     with pytest.raises(ValueError, match="resample"):
-        real.make(np.zeros((90, 160)))
+        real.seen(np.zeros((90, 160)))
 
 
 def test_a_camera_goes_on_where_another_stopped(device, scenes):

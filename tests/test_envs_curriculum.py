@@ -14,7 +14,7 @@ from vd.envs.cfg import (
     SuccessCfg,
     TableCfg,
 )
-from vd.envs.curriculum import LEVELS, Levels, first_levels, moving_levels, next_levels
+from vd.envs.curriculum import LEVELS, Levels, moving_levels, next_levels
 from vd.envs.effects import PARAMETERS
 from vd.envs.parameters import GOAL_START_RAD, STILLNESS_START
 from vd.envs.reorient import ReorientEnv
@@ -73,7 +73,7 @@ def test_levels_rise_one_after_the_other_and_fall_in_reverse():
     curriculum = CurriculumCfg(goals=half, stillness=half, physics=half, air=half)
     task = ReorientCfg(curriculum=curriculum, table=TableCfg(away_share=0.5))
     moving = moving_levels(task)
-    levels = first_levels(moving)
+    levels = Levels(**dict.fromkeys(moving, 0.0))
     seen = [dataclasses.astuple(levels)]
     for rate in [WELL] * 9 + [SO_SO] + [BADLY] * 9:
         levels = next_levels(levels, rate, moving)

@@ -108,7 +108,6 @@ def test_velocity_limit_and_inertia_are_per_world():
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        (np.zeros((D, 3)), "shape"),
         (rows(COMMAND_DELAY=0.5), "command_delay:delay_s"),
         (rows(TORQUE_LIMIT=np.nan), "torque_limit:tau_max_nm"),
     ],

@@ -39,8 +39,8 @@ def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone
     with pytest.raises(FileExistsError, match="holds a run of other settings"):
         teacher_cfg(replace(cfg, seed=1))
     for name, remedy in (
-        ("dclaw4-vision", "adapt its teacher, dclaw4, .*vd-train tracker .* --alignment"),
-        ("dclaw4-cube", "vd-train teacher --init dclaw4-cube --hand-layer"),
+        ("dclaw4-vision", "sees by camera; give its teacher, dclaw4"),
+        ("dclaw4-cube", "does not say how it was trained.*vd-train teacher --init POLICY"),
     ):
         with pytest.raises(ValueError, match=remedy):
             teacher_cfg(replace(cfg, policy=name, out=cfg.out.with_name("other")))

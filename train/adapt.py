@@ -1,4 +1,4 @@
-"""``vd-train adapt``: train a teacher further in an identified model of its hand, and what that is worth."""
+"""``vd-train adapt``: train a teacher further in an identified model of its hand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -68,8 +68,8 @@ class AdaptCfg:
     """
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder; by default
-    the installed one of the layer's hand."""
+    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder; by
+    default the installed one of the layer's hand."""
     hand_layer: Path | None = None
     """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap; by default
     gap/identified.usda."""
@@ -191,13 +191,12 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     """
     assert cfg.policy is not None and cfg.hand_layer is not None
     check_names([cfg.policy], cfg.objects)
-    _check_teacher(cfg.policy)
     try:
         base = settings_of(cfg.policy, PRESETS["gpu"]())
     except ValueError as error:
         raise ValueError(
-            f"{cfg.policy} cannot go on by itself ({error}): vd-train teacher --init {cfg.policy} "
-            f"--hand-layer {cfg.hand_layer} --preset ..."
+            f"{error}; adapt goes on with settings of a teacher's own; with others: vd-train teacher "
+            f"--init POLICY --hand-layer {cfg.hand_layer} --preset ..."
         ) from error
     from vd.assets_usd.hands import load_hand
 
@@ -229,30 +228,15 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     return run
 
 
-def _check_teacher(name: str) -> None:
-    """Refuse what sees by camera: its teacher learns, and sees again afterwards."""
-    from vd.policy.actor import TrainedPolicy
-    from vd.policy.agents import open_policy
-
-    policy = open_policy(name, "cpu")
-    if policy is None:
-        raise ValueError(f"{name} has learned nothing; name a trained teacher")
-    if not isinstance(policy, TrainedPolicy):
-        network = f" --alignment {name}" if policy.kind == "vision" else ""
-        raise ValueError(
-            f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see "
-            f"again: vd-train tracker runs/adapted --objects SET{network}"
-        )
-
-
 def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
-    """Compare the policy before and after, in the nominal and in the identified model, and write the page."""
+    """Compare the policy before and after, in both models of the hand, and write the page."""
     from vd.evaluate.compare import compare
     from vd.evaluate.page import percent, settings_text, shown_name, write_page
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
-    before, after = str(cfg.policy), policy_at(cfg.out)
+    before = str(cfg.policy)
+    after = policy_at(cfg.out)
     evaluation = EvalCfg(
         policies=(before, after),
         objects=run.env.objects,
@@ -264,7 +248,8 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     for model, layer in ((NOMINAL, NO_LAYER), (IDENTIFIED, str(cfg.hand_layer))):
         results.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
     rows = tuple(row for compared in results for row in compared.rows if row.stopped_by != SUCCESS)
-    result, page = Result(rows, results[0].software), cfg.out / PAGE
+    result = Result(rows, results[0].software)
+    page = cfg.out / PAGE
     rate = {
         (model, policy): percent(row.overall.outcomes["success"])
         for (model, _), headlines in result.headlines().items()

@@ -10,6 +10,7 @@ from vd.envs.curriculum import LEVELS
 
 if TYPE_CHECKING:
     from vd.policy.contract import PolicySpec
+    from vd.train.ppo import TeacherPPO
     from vd.train.presets import TeacherCfg
 
 CRITIC_WARMUP = 50
@@ -21,6 +22,8 @@ MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second
 moment.
 """
+FIRST_LAYER = "mlp.0.weight"
+"""Weights whose shape says how many values a network reads."""
 REMEDY = "give the policy's settings, or leave --preset out, which takes them over"
 _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
@@ -79,7 +82,7 @@ def read_start(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
-    """Settings with which a run goes on as what it begins from was trained, where no preset is asked for.
+    """Settings of the training of what a run begins from, for one that asks for no preset.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -109,72 +112,46 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     return replace(base, run=run, ppo=ppo, policy=policy, env=env)
 
 
-def warmup_iterations(state: Mapping[str, Any]) -> int:
-    """Iterations in which the critic has to learn alone after a begin from a checkpoint or policy."""
-    if "critic_state_dict" not in state:
-        return CRITIC_WARMUP
-    if "optimizer_state_dict" not in state:
-        return MOMENTS_WARMUP
-    return int(state.get("critic_warmup", 0))  # what its own run still lacked
+def take_critic(learner: "TeacherPPO", state: Mapping[str, Any]) -> int:
+    """Take over critic and optimiser, as far as they are there and fit.
 
-
-def with_fitting_critic(state: dict[str, Any], critic: Mapping[str, Any]) -> dict[str, Any]:
-    """A checkpoint or policy without a critic that reads another number of values.
+    A critic that begins from nothing begins with the actor's normalisation, if it reads the same.
 
     Args:
-        state: The checkpoint, not changed. Critic and optimiser may be missing, as in an exported
-            policy.
-        critic: Weights of the critic that it is for.
+        learner: Of the run that begins.
+        state: A checkpoint, or a policy without an optimiser, and maybe without a critic.
+
+    Returns:
+        Iterations in which the critic has to learn alone first.
     """
-    first = "mlp.0.weight"
-    if state.get("critic_state_dict", critic)[first].shape == critic[first].shape:
-        return state
-    missing = {"critic_state_dict", "optimizer_state_dict"}
-    return {key: state[key] for key in state.keys() - missing}
+    own = learner.critic.state_dict()
+    critic = state.get("critic_state_dict")
+    if critic is not None and critic[FIRST_LAYER].shape == own[FIRST_LAYER].shape:
+        learner.critic.load_state_dict(critic)
+        if "optimizer_state_dict" not in state:
+            return MOMENTS_WARMUP
+        learner.optimizer.load_state_dict(state["optimizer_state_dict"])
+        return int(state.get("critic_warmup", 0))  # what its own run still lacked
+    actor = state["actor_state_dict"]
+    mean = "obs_normalizer._mean"
+    if mean in actor and actor[mean].shape == own[mean].shape:
+        normaliser = {name: actor[name] for name in own if name.startswith("obs_normalizer.")}
+        learner.critic.load_state_dict(normaliser, strict=False)
+    return CRITIC_WARMUP
 
 
-def completed(
-    state: dict[str, Any], own: dict[str, Any], levels: tuple[float, ...] | None = None
-) -> dict[str, Any]:
-    """What a run begins from as a checkpoint: what it lacks is that of the run.
-
-    The critic reads what the actor reads, so where it is missing it begins with the actor's
-    normalisation. A policy that says nothing of a level has come to the end of it.
-
-    Args:
-        state: A checkpoint, or a policy, with a critic that fits or none.
-        own: Networks, optimiser and window of the run: ``critic_state_dict``,
-            ``optimizer_state_dict``, ``window``.
-        levels: Levels of the curriculum to begin at, rather than those of the file.
+def first_levels(state: Mapping[str, Any], asked: tuple[float, ...] | None) -> dict[str, float]:
+    """Levels of the curriculum at which a run begins: those asked for, or those of ``state``.
 
     Raises:
         ValueError: A level is not within 0 and 1.
     """
-    if "critic_state_dict" not in state:
-        critic = own["critic_state_dict"]
-        normaliser = {
-            k: v
-            for k, v in state["actor_state_dict"].items()
-            if k.startswith("obs_normalizer.") and v.shape == critic[k].shape
-        }
-        # One that reads more begins with a normalisation of its own.
-        state = state | {"critic_state_dict": critic | (normaliser if len(normaliser) == 4 else {})}
-    if "optimizer_state_dict" not in state:
-        state = state | {
-            "optimizer_state_dict": own["optimizer_state_dict"],
-            "elapsed_s": 0.0,
-            "best": None,
-            "window": own["window"],
-            "ranks": [{"env": {"levels": state["stage"]}}],
-            "infos": None,
-        }
-    if levels is None:
-        return state
-    if not all(0.0 <= level <= 1.0 for level in levels):
-        given = " ".join(f"{level:g}" for level in levels)
+    if asked is None:
+        return dict(state["stage"])
+    if not all(0.0 <= level <= 1.0 for level in asked):
+        given = " ".join(f"{level:g}" for level in asked)
         raise ValueError(f"--init-levels is {given}; levels lie within 0 and 1")
-    moved = {"levels": dict(zip(LEVELS, levels, strict=True))}
-    return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
+    return dict(zip(LEVELS, asked, strict=True))
 
 
 def check_fit(
@@ -189,7 +166,8 @@ def check_fit(
     from vd.policy.contract import PolicySpec
 
     trained = from_dict(PolicySpec, state["policy"], where="policy")
-    hand, here = state["task"].get("hand"), task.get("hand")
+    hand = state["task"].get("hand")
+    here = task.get("hand")
     if trained.num_actions != spec.num_actions:
         raise ValueError(
             f"--init: {path} moves {trained.num_actions} joints of {hand}, and this run's hand, "
@@ -201,7 +179,8 @@ def check_fit(
         where=f"--init: {path}: task.observation",
     )
     for name in ("hidden", "distribution", "normalise_observations"):
-        theirs, ours = getattr(trained, name), getattr(spec, name)
+        theirs = getattr(trained, name)
+        ours = getattr(spec, name)
         if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
             raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {REMEDY}")
@@ -213,7 +192,7 @@ def check_fit(
 
 
 def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
-    """Settings that change what observations and actions mean to a policy, each with what it was and is.
+    """Settings that change what observations and actions mean, each with what it was and is.
 
     Such as ``env.observation.view goal, here world``. A run may want them changed; so they are no
     errors. What is younger than the policy's file counts as it is by default, as it does where the

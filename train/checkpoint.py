@@ -98,7 +98,7 @@ def _newest_sound(files: list[Path], network: str) -> Path:
 
 
 def prune_checkpoints(run_dir: Path, newest: int) -> None:
-    """Delete old periodic checkpoints up to iteration ``newest``, and what a killed run left half-written.
+    """Delete old checkpoints up to iteration ``newest``, and what a killed run left half-written.
 
     What a run that went on from an older checkpoint finds after that stays.
     """
@@ -186,7 +186,7 @@ def set_random_state(state: dict[str, Any], device: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` with NumPy arrays and scalars as tensors and numbers, which load without running code."""
+    """``value`` with NumPy arrays as tensors, which load without running code."""
     if isinstance(value, np.ndarray):
         return {_ARRAY: torch.from_numpy(np.ascontiguousarray(value)), "shape": list(value.shape)}
     if isinstance(value, np.generic):

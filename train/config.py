@@ -110,7 +110,7 @@ class RunCfg:
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:
-    """Minibatches in a rollout of ``num_envs`` environments, of at most ``minibatch_size`` samples each."""
+    """Minibatches of at most ``minibatch_size`` samples in a rollout of ``num_envs`` environments."""
     return max(1, math.ceil(num_envs * ppo.rollout_steps / ppo.minibatch_size))
 
 

@@ -6,13 +6,12 @@ the protocol of its motors; a small training learns. ``index.html`` is written a
 begins or ends. A part that fails says so there, and the others go on.
 """
 
-import os
+import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,8 +42,8 @@ COMPACT = 3.0
 """Longest over shortest side, at most, of a mesh that is chosen; of half of our procedural objects
 it is less (their median is 2.9), of flat and long things, of which policies drop most, more."""
 IMPORT = ("--time-limit", "20", "--mcts-iterations", "5")
-"""Processor time of each decomposition [s], and a quarter of the usual search effort: a stapler then
-takes 8 s in place of 29, and its parts are as good."""
+"""Processor time of each decomposition [s], and a quarter of the usual search effort: a stapler
+then takes 8 s in place of 29, and its parts are as good."""
 EPISODES = 3
 """Starts and goals of every object: what two cores simulate in half a minute."""
 FILM_S = 8.0
@@ -102,7 +101,9 @@ class Part:
 
     name: str
     title: str
-    folder: Path
+    show: Callable[["Part"], dict[str, Any]]
+    """Does it; returns what the template takes."""
+    out: Path
     state: str = "waiting"
     """waiting, running, done, failed or interrupted."""
     seconds: float = 0.0
@@ -111,56 +112,52 @@ class Part:
     shown: dict[str, Any] = field(default_factory=dict)
     """What the template takes, once it is done."""
 
-    def run(self, *commands: Sequence[str | Path]) -> None:
-        """Run public commands side by side, the output of each in a file of the part's folder.
+    @property
+    def folder(self) -> Path:
+        """Its folder."""
+        return self.out / self.name
+
+    def run(self, *words: str | Path) -> None:
+        """Run a public command, its output in a file of the part's folder.
 
         Args:
-            commands: Their words, the name first.
+            words: Its words, the name first.
 
         Raises:
-            RuntimeError: One failed; the others are ended.
+            RuntimeError: It failed.
         """
-        running = []
-        try:
-            for words in commands:
-                line = [str(word) for word in words]
-                self.commands.append(" ".join(line))
-                print(f"  $ {' '.join(line)}", flush=True)
-                log = self.folder / f"{len(self.commands)}-{line[0]}.txt"
-                with log.open("w") as output:
-                    process = subprocess.Popen(
-                        [Path(sys.executable).with_name(line[0]), *line[1:]],
-                        stdin=subprocess.DEVNULL,
-                        stdout=output,
-                        stderr=subprocess.STDOUT,
-                        start_new_session=True,  # Ctrl-C reaches this process, which ends them
-                    )
-                running.append((process, line, log))
-            for process, line, log in running:
-                status = process.wait()
-                if status != 0:
-                    said = log.read_text(errors="replace").strip().split("\n")
-                    reason = "\n".join(said[-REASON_LINES:])
-                    raise RuntimeError(f"{' '.join(line)} ended with status {status}: {reason}")
-        finally:
-            for process, _, _ in running:
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGTERM)  # and all that it started
-                process.wait()
+        name, *rest = map(str, words)
+        line = shlex.join([name, *rest])
+        self.commands.append(line)
+        print(f"  $ {line}", flush=True)
+        log = self.folder / f"{len(self.commands)}-{name}.txt"
+        with log.open("w") as output:
+            status = subprocess.run(
+                [Path(sys.executable).with_name(name), *rest],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                check=False,
+            ).returncode
+        if status != 0:
+            said = log.read_text(errors="replace").strip().split("\n")
+            reason = "\n".join(said[-REASON_LINES:])
+            raise RuntimeError(f"{line} ended with status {status}: {reason}")
 
 
 class Demo:
-    """The parts, in their order; each is a method of its name."""
+    """The parts, in their order."""
 
     def __init__(self, cfg: DemoCfg) -> None:
-        self.cfg, self.page, self.started = cfg, cfg.out / "index.html", time.monotonic()
-        titles = {
-            "camera": "Objects never seen, turned by camera",
-            "gap": "A hidden effect, found and closed",
-            "twin": "A hand behind its motors",
-            "training": "A small training",
-        }
-        parts = [Part(name, title, cfg.out / name) for name, title in titles.items()]
+        self.cfg = cfg
+        self.page = cfg.out / "index.html"
+        self.started = time.monotonic()
+        parts = [
+            Part("camera", "Objects never seen, turned by camera", self.camera, cfg.out),
+            Part("gap", "A hidden effect, found and closed", self.gap, cfg.out),
+            Part("twin", "A hand behind its motors", self.twin, cfg.out),
+            Part("training", "A small training", self.training, cfg.out),
+        ]
         self.parts = parts[:1] if cfg.quick else parts
         self.policy = default_policy(HAND, "vision", "tracking")
         """Installed policy that sees by camera, the vision policy if it is here."""
@@ -179,20 +176,22 @@ class Demo:
             KeyboardInterrupt: Interrupted; the page says so and has what is there.
         """
         for number, part in enumerate(self.parts, start=1):
-            began, part.state = time.monotonic(), "running"
+            began = time.monotonic()
+            part.state = "running"
             print(f"\n[{number}/{len(self.parts)}] {part.title}", flush=True)
             shutil.rmtree(part.folder, ignore_errors=True)
             part.folder.mkdir(parents=True)
             self.write(running=True)
             try:
-                part.shown = getattr(self, part.name)(part)
+                part.shown = part.show(part)
                 part.state = "done"
             except KeyboardInterrupt:
                 part.state = "interrupted"
                 self.write(running=False)
                 raise
             except Exception as error:  # whatever it is, the other parts go on
-                part.state, part.error = "failed", str(error) or type(error).__name__
+                part.state = "failed"
+                part.error = str(error) or type(error).__name__
                 print(f"  failed: {part.error}", file=sys.stderr, flush=True)
             part.seconds = time.monotonic() - began
             self.write(running=part is not self.parts[-1])
@@ -206,18 +205,17 @@ class Demo:
 
     def camera(self, part: Part) -> dict[str, Any]:
         """The shipped policy turns objects that it has never seen, by camera: film, and success."""
-        film, out = part.folder / "film.mp4", part.folder
+        film = part.folder / "film.mp4"
         if self.cfg.meshes is not None:
             self.objects = import_meshes(part, self.cfg.meshes)
         options = (self.policy, "--objects", *self.objects, "--seed", str(self.cfg.seed))
-        part.run(
-            ["vd-eval", *options, "--episodes", str(EPISODES), "--out", out],
-            ["vd-play", *options, "--cells", str(SHOWN), "--seconds", str(FILM_S), "--video", film],
-        )
+        part.run("vd-eval", *options, "--episodes", str(EPISODES), "--out", part.folder)
+        shown = ("--cells", str(SHOWN), "--seconds", str(FILM_S))
+        part.run("vd-play", *options, *shown, "--video", film)
         from vd.evaluate.page import percent
         from vd.evaluate.result import Result
 
-        row = next(row for row in Result.read(out / "eval.json").rows if row.headline)
+        row = next(row for row in Result.read(part.folder / "eval.json").rows if row.headline)
         tolerance = str(PAPER.success.rotation_rad)
         lines = []
         for summary in (*row.per_object, row.overall):
@@ -240,10 +238,11 @@ class Demo:
 
     def gap(self, part: Part) -> dict[str, Any]:
         """An effect hidden in a simulated servo, found and closed."""
-        recording, analysis = part.folder / "recording", part.folder / "analysis"
+        recording = part.folder / "recording"
+        analysis = part.folder / "analysis"
         seed = ("--seed", str(self.cfg.seed))
-        part.run(["vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, *seed])
-        part.run(["vd-gap", "run", recording, "--out", analysis, *seed])
+        part.run("vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, *seed)
+        part.run("vd-gap", "run", recording, "--out", analysis, *seed)
         from vd.api import gap_verdict
 
         verdict = gap_verdict(analysis / "report.json")
@@ -261,46 +260,31 @@ class Demo:
     def twin(self, part: Part) -> dict[str, Any]:
         """A simulated hand behind the protocol of its motors, with the policy that sees."""
         log = part.folder / "log"
-        words = [
-            "vd-deploy",
-            self.policy,
-            "--hand",
-            HAND,
-            "--twin",
-            "--object",
-            self.first_object(),
-        ]
-        words += ["--seed", str(self.cfg.seed), "--safety.misses", MISSES]
-        part.run([*words, "--log", log])
+        hand = ("--hand", HAND, "--twin", "--object", self.first_object())
+        options = ("--seed", str(self.cfg.seed), "--safety.misses", MISSES)
+        part.run("vd-deploy", self.policy, *hand, *options, "--log", log)
         from vd.logs.hand_log import read_log
 
         run = read_log(log)
-        sent, stops = (
-            sorted(1e3 * run.columns["sent_s"]),
-            ", ".join(stop.outcome for stop in run.stops),
-        )
-        late = f"{sent[len(sent) // 2]:.0f}, at most {sent[-1]:.0f}"
-        row = (len(sent), f"{run.columns['missed'][-1]:.0f}", late, stops)
-        film, name = log / "run.mp4", run.run["object"]["name"]
-        return {"film": film, "row": row, "object": name, "page": f"{part.name}/log/run.html"}
+        sent_ms = sorted(1e3 * run.columns["sent_s"])
+        late = f"{sent_ms[len(sent_ms) // 2]:.0f}, at most {sent_ms[-1]:.0f}"
+        stops = ", ".join(stop.outcome for stop in run.stops)
+        return {
+            "film": log / "run.mp4",
+            "row": (len(sent_ms), f"{run.columns['missed'][-1]:.0f}", late, stops),
+            "object": run.run["object"]["name"],
+            "page": f"{part.name}/log/run.html",
+        }
 
     def training(self, part: Part) -> dict[str, Any]:
         """A small training, with its curve."""
-        run, film = part.folder / "run", part.folder / "film.mp4"
+        run = part.folder / "run"
+        film = part.folder / "film.mp4"
         minutes = max(self.cfg.minutes - self.minutes - AROUND_TRAINING_MIN, LEAST_TRAINING_MIN)
         seed = ("--seed", str(self.cfg.seed))
-        words = (
-            "vd-train",
-            "teacher",
-            "--preset",
-            "cpu-demo",
-            *TASK,
-            *seed,
-            "--max-minutes",
-            f"{minutes:.2f}",
-        )
-        part.run([*words, "--out", run])
-        part.run(["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film])
+        length = ("--max-minutes", f"{minutes:.2f}")
+        part.run("vd-train", "teacher", "--preset", "cpu-demo", *TASK, *seed, *length, "--out", run)
+        part.run("vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film)
         from vd.train.metrics import PROGRESS_FILE, read_progress
 
         rows = settled(read_progress(run / PROGRESS_FILE))
@@ -350,7 +334,7 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, ...]:
     chosen = choose_meshes(meshes)
     if chosen:
         with suppress(RuntimeError):  # some cannot be imported: what it left counts
-            part.run(["vd-assets", "import", *chosen, "--out", out, *IMPORT])
+            part.run("vd-assets", "import", *chosen, "--out", out, *IMPORT)
     imported = object_files(out) if out.is_dir() else []
     left = SHOWN - len(imported)
     sets = (str(out),) if imported else ()

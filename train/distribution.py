@@ -1,4 +1,4 @@
-"""Gaussians of actions that are sampled without a wait for the device, one of them with a bounded std."""
+"""Gaussians of actions that are sampled without a wait for the device."""
 
 import math
 
@@ -61,7 +61,8 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
     def update(self, mlp_output: torch.Tensor) -> None:
         """Set mean and standard deviation from the network's output, shape ``[..., 2, D]``."""
         mean, raw = torch.unbind(mlp_output, dim=-2)
-        low, high = self.log_floor, self._log_ceiling
+        low = self.log_floor
+        high = self._log_ceiling
         self._distribution = Normal(mean, torch.exp(low + (high - low) * torch.sigmoid(raw)))
 
     def init_mlp_weights(self, mlp: torch.nn.Module) -> None:

@@ -82,7 +82,7 @@ def _export_checkpoint(path: Path, output: Path) -> None:
 
 
 def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
-    """Write a policy's networks with its contract, and compare them with onnxruntime if that is installed.
+    """Write a policy's networks with its contract, and compare them with onnxruntime if it is there.
 
     The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they
     normalise, to the mean ``action`` [N, D]. The network of a vision policy goes to

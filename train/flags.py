@@ -98,7 +98,8 @@ def parse_teacher(
     elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
         _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](), file)
-        preset, chosen = machine_preset(value_of(arguments, "--device")), True
+        preset = machine_preset(value_of(arguments, "--device"))
+        chosen = True
         start = PRESETS[preset]()
     else:
         start = PRESETS[preset or "gpu"]()
@@ -122,7 +123,8 @@ def starting(arguments: list[str]) -> tuple[list[str], ConfigFile | None]:
     if file is None:
         return arguments, None
     words = file.words(STARTS)
-    named, asked = value_of(words, "--preset"), value_of(arguments, "--preset")
+    named = value_of(words, "--preset")
+    asked = value_of(arguments, "--preset")
     if named is not None and asked not in (None, named):
         raise ValueError(
             f"--preset {asked}: the settings of {file.path} are those of {named}; name one"
@@ -147,7 +149,8 @@ def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
         ValueError: Names the flag, what the run began with, and the remedy.
     """
     for name in ("preset", "init", "stage", "smoke"):
-        flag, begun = f"--{name}", getattr(saved, name, None)
+        flag = f"--{name}"
+        begun = getattr(saved, name, None)
         asked = value_of(arguments, flag) if name != "smoke" else None
         differs = asked is not None and asked != str(begun)
         if differs or (name == "smoke" and flag in arguments and not begun):
@@ -202,7 +205,8 @@ def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) 
         kind, arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP
     )
     check_names((), cfg.env.objects, cfg.env.hand)
-    drawn, before = cfg.env.randomisation, default.env.randomisation
+    drawn = cfg.env.randomisation
+    before = default.env.randomisation
     given = [name for name, value in vars(before).items() if getattr(drawn, name) != value]
     if given and not drawn.enabled and given != ["enabled"]:
         raise ValueError(
@@ -212,12 +216,14 @@ def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) 
 
 
 def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
-    """The dataclass ``kind``, of which help does not show the fields ``hidden``, named by dotted path."""
+    """The dataclass ``kind``, of which help does not show the fields ``hidden``, dotted paths."""
     shown: dict[str, Any] = {}
     suppressed: Any = tyro.conf.Suppress
-    hints, annotations = get_type_hints(kind), get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind)
+    annotations = get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
-        path, hint = where + field.name, hints[field.name]
+        path = where + field.name
+        hint = hints[field.name]
         if path in hidden:
             shown[field.name] = suppressed[hint]
         elif any(name.startswith(f"{path}.") for name in hidden):
@@ -254,6 +260,6 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
 
 
 def write_config(cfg: "TeacherCfg | AlignmentTrainCfg | StudentTrainCfg") -> None:
-    """Save the resolved configuration in the run's folder, as ``--resume`` takes it, on any machine."""
+    """Save the resolved configuration in the run's folder, for ``--resume`` on any machine."""
     run = replace(cfg.run, device="auto")
     write_json(cfg.run.out / CONFIG_NAME, to_dict(replace(cfg, resume=None, run=run)))

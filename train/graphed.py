@@ -13,7 +13,7 @@ need.
 
 
 class Recorded:
-    """A function that computes gradients, recorded at its first call and replayed from a CUDA graph.
+    """A function that computes gradients, recorded at its first call and then replayed.
 
     A graph repeats launches with the addresses that it was recorded with, so the function has to
     read inputs and weights that stay where they are, has to change nothing but the gradients, and
@@ -28,7 +28,8 @@ class Recorded:
     def __init__(
         self, function: Callable[[], torch.Tensor], parameters: Sequence[nn.Parameter]
     ) -> None:
-        self._function, self._parameters = function, parameters
+        self._function = function
+        self._parameters = parameters
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> torch.Tensor:

@@ -91,9 +91,13 @@ class TrainingLoop:
         device: str,
         env: "ReorientVecEnv | None" = None,
     ) -> None:
-        self.run, self.device, self.env = run, device, env
+        self.run = run
+        self.device = device
+        self.env = env
         self.rank, self.world_size = join_processes(device)
-        self.iteration, self.env_steps, self._elapsed_s = 0, 0, 0.0
+        self.iteration = 0
+        self.env_steps = 0
+        self._elapsed_s = 0.0
         self.new_episodes = ""
         self._deadline: float | None = None
         self._signal = 0
@@ -133,7 +137,8 @@ class TrainingLoop:
         first = saved = self.iteration
         total = self.total_iterations if iterations is None else first + iterations
         self._begin()
-        lines, started = ProgressLines(total, enabled=self.is_main), time.monotonic()
+        lines = ProgressLines(total, enabled=self.is_main)
+        started = time.monotonic()
         with contextlib.ExitStack() as stack:
             log: ProgressFile | None = None
             if self.is_main:
@@ -194,7 +199,10 @@ class TrainingLoop:
             torch.distributed.destroy_process_group()
 
     def _row(self) -> dict[str, Any] | None:
-        """One iteration; its row for ``progress.jsonl``, or ``None`` if a signal cut its rollout short."""
+        """One iteration.
+
+        Its row for ``progress.jsonl``, or ``None`` if a signal cut its rollout short.
+        """
         if self.is_distributed:
             watch_iteration()
         start = time.perf_counter()
@@ -243,7 +251,8 @@ class TrainingLoop:
         if self.is_distributed:
             wishes = torch.tensor([float(self._signal), float(late)], device=self.device)
             torch.distributed.all_reduce(wishes, op=torch.distributed.ReduceOp.MAX)
-            self._signal, late = int(wishes[0]), bool(wishes[1])
+            self._signal = int(wishes[0])
+            late = bool(wishes[1])
             interrupt.note(self._signal)
         return bool(self._signal) or late
 
@@ -273,8 +282,9 @@ class TrainingLoop:
         return {"format": CHECKPOINT_FORMAT} | self._shared_state() | counters | {"ranks": ranks}
 
     def _restore(self, state: dict[str, Any]) -> None:
-        """Take over counters, environments and random state, all but the first only if they fit this run."""
-        self.iteration, self.env_steps = state["iter"], state["env_steps"]
+        """Take over counters, and environments and random state if they fit this run."""
+        self.iteration = state["iter"]
+        self.env_steps = state["env_steps"]
         self._elapsed_s = state["elapsed_s"]
         self.new_episodes = self._misfit(state["ranks"])
         if not self.new_episodes:

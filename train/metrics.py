@@ -1,4 +1,4 @@
-"""What a run reports: sums on the device, read once an iteration, as JSON lines and in TensorBoard."""
+"""What a run reports once an iteration, as JSON lines and in TensorBoard."""
 
 import json
 import math
@@ -19,7 +19,7 @@ BOARD_FOLDER = "tensorboard"
 
 
 class StepMeans:
-    """Means of ``extras["log"]`` over an iteration's steps, without a copy to the host before the end."""
+    """Means of ``extras["log"]`` over an iteration's steps, copied to the host at its end."""
 
     def __init__(self) -> None:
         self._names: tuple[str, ...] = ()
@@ -30,13 +30,15 @@ class StepMeans:
         """Add one step's scalars; every step has the same keys."""
         values = torch.stack(tuple(log.values()))
         if self._sum is None:
-            self._names, self._sum = tuple(log), torch.zeros_like(values)
+            self._names = tuple(log)
+            self._sum = torch.zeros_like(values)
         self._sum += values
         self._steps += 1
 
     def clear(self) -> None:
         """Forget the steps so far."""
-        self._sum, self._steps = None, 0
+        self._sum = None
+        self._steps = 0
 
     def read(self, world_size: int = 1) -> dict[str, float]:
         """Means by name, averaged over the ranks, and start anew. Waits for the device."""
@@ -105,7 +107,7 @@ class GoalWindow:
 
 
 class ProgressFile:
-    """One JSON object per iteration in ``progress.jsonl``, and the same numbers for ``logger`` (``RunCfg``).
+    """One JSON object an iteration in ``progress.jsonl``, and the same for ``logger`` (``RunCfg``).
 
     Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones
     anew.

@@ -42,7 +42,7 @@ first.
 
 
 class TeacherPPO(PPO):
-    """PPO with two learning rates, an unclipped value loss and one gradient norm for actor and critic.
+    """PPO with two learning rates, an unclipped value loss and one gradient norm for both networks.
 
     What differs from rsl-rl's PPO, and why:
 
@@ -137,7 +137,7 @@ class TeacherPPO(PPO):
         self.optimizer.param_groups[CRITIC_GROUP]["lr"] = critic
 
     def update(self) -> dict[str, float]:
-        """Run all epochs over the rollout, or those until the adaptive schedule sees the actor run away.
+        """Run all epochs over the rollout, or those until the actor runs away.
 
         Returns:
             Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl``
@@ -150,7 +150,8 @@ class TeacherPPO(PPO):
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
         self._take_samples()
         watched = self.actor_learns and self.schedule == "adaptive"
-        divergence, steps = 0.0, []
+        divergence = 0.0
+        steps = []
         for rows in self.minibatches():
             steps.append(self._minibatch_step(rows))
             if watched and len(steps) % self.num_mini_batches == 0:
@@ -163,7 +164,8 @@ class TeacherPPO(PPO):
         if self.actor_learns:
             self._update_normalisation(self.actor)
         self._update_normalisation(self.critic)
-        returns, values = self.storage.returns, self.storage.values
+        returns = self.storage.returns
+        values = self.storage.values
         explained = 1.0 - (returns - values).var() / returns.var().clamp_min(1e-8)
         self.storage.clear()
         names = (*STATISTICS, "explained_variance")
@@ -204,10 +206,8 @@ class TeacherPPO(PPO):
 
     def minibatches(self) -> Iterator[torch.Tensor]:
         """Rows of samples, permuted anew in every epoch; a remainder is left out at random."""
-        samples, size = (
-            self.storage.num_envs * self.storage.num_transitions_per_env,
-            self._minibatch_size,
-        )
+        samples = self.storage.num_envs * self.storage.num_transitions_per_env
+        size = self._minibatch_size
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(samples, device=self.device)
             yield from order[: size * self.num_mini_batches].split(size)
@@ -251,7 +251,8 @@ class TeacherPPO(PPO):
             kl = self.actor.get_kl_divergence(old, self.actor.output_distribution_params).mean()
         ratio = torch.exp(log_ratio)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        advantages, weights = batch["advantages"], batch["weights"]
+        advantages = batch["advantages"]
+        weights = batch["weights"]
         surrogate = -(weights * torch.minimum(advantages * ratio, advantages * clipped)).mean()
         errors = batch["returns"] - self.critic(observations).squeeze(-1)
         value = (weights * errors.square()).mean()
@@ -293,7 +294,7 @@ class TeacherPPO(PPO):
         return float(kl)
 
     def _adapt_learning_rate(self, divergence: float) -> None:
-        """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""
+        """Move the actor's learning rate towards updates whose KL divergence is ``desired_kl``."""
         if divergence > self.desired_kl * KL_BAND:
             self.learning_rate = max(MIN_LEARNING_RATE, self.learning_rate / KL_STEP)
         elif 0.0 < divergence < self.desired_kl / KL_BAND:
@@ -308,7 +309,8 @@ def make_learner(
 
     The actor reads the first group of observations, the critic all.
     """
-    observations, device = env.get_observations(), env.device
+    observations = env.get_observations()
+    device = env.device
     groups = list(observations.keys())
     distribution: dict[str, Any] = {"init_std": policy.initial_std, "std_range": policy.std_range}
     if policy.distribution == "gaussian":

@@ -30,8 +30,10 @@ class ProgressLines:
     """
 
     def __init__(self, total: int, *, enabled: bool = True) -> None:
-        self._total, self._enabled = total, enabled
-        self._printed_s, self._waiting = -INTERVAL_S, ""
+        self._total = total
+        self._enabled = enabled
+        self._printed_s = -INTERVAL_S
+        self._waiting = ""
 
     def __enter__(self) -> "ProgressLines":
         self.note("first iteration ...")
@@ -52,7 +54,8 @@ class ProgressLines:
         self._waiting = f"{' | '.join(parts)}\n  {_terms(row)}"
         if time.monotonic() - self._printed_s >= INTERVAL_S:
             self.note(self._waiting)
-            self._printed_s, self._waiting = time.monotonic(), ""
+            self._printed_s = time.monotonic()
+            self._waiting = ""
 
     def note(self, message: str) -> None:
         """Print a message."""

@@ -16,21 +16,8 @@ from vd.envs.curriculum import blend
 from vd.policy.actor import teacher_in
 from vd.policy.bundle import write_policy
 from vd.policy.contract import PolicySpec
-from vd.train.begin import (
-    check_fit,
-    completed,
-    read_start,
-    unlike,
-    warmup_iterations,
-    with_fitting_critic,
-)
-from vd.train.checkpoint import (
-    BEST_NAME,
-    POLICY_NAME,
-    load_checkpoint,
-    save_checkpoint,
-    without_worlds,
-)
+from vd.train.begin import check_fit, first_levels, read_start, take_critic, unlike
+from vd.train.checkpoint import BEST_NAME, POLICY_NAME, load_checkpoint, save_checkpoint
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.failures import ObjectFailures
 from vd.train.loop import TrainingLoop, check_update
@@ -70,13 +57,17 @@ class TeacherRunner(TrainingLoop):
         device: str,
     ) -> None:
         super().__init__(run, device=device, env=env)
-        self.ppo, self.policy_cfg, self.task, self.interface = ppo, policy, task, interface or {}
+        self.ppo = ppo
+        self.policy_cfg = policy
+        self.task = task
+        self.interface = interface or {}
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self.failures: ObjectFailures | None = None
         if ppo.failure_floor is not None:
             self.failures = ObjectFailures(env.env.world_object, ppo.failure_floor, device)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
-        self._means, self._window = StepMeans(), self._new_window()
+        self._means = StepMeans()
+        self._window = self._new_window()
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._better = False
@@ -103,7 +94,7 @@ class TeacherRunner(TrainingLoop):
         self._take(load_checkpoint(Path(path), self.device), path)
 
     def begin_from(self, path: str | Path, levels: tuple[float, ...] | None = None) -> None:
-        """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
+        """Begin with networks, optimiser, curriculum and counters of another run.
 
         Environments, random states, learning rates and the choice of the best checkpoint are this
         run's own, and so are a critic and an optimiser that the file lacks; then the critic learns
@@ -115,13 +106,17 @@ class TeacherRunner(TrainingLoop):
         state = read_start(Path(path), self.device)
         check_fit(state, self._spec(), self.task, path)
         self.unlike = unlike(state["task"], self.task)
-        fresh = self.alg.save() | {"window": self._window.state_dict()}
-        state = with_fitting_critic(state, fresh["critic_state_dict"])
-        self._take(without_worlds(completed(state, fresh, levels)), path)
+        stage = first_levels(state, levels)
+        self.alg.actor.load_state_dict(state["actor_state_dict"])
+        self.critic_warmup = take_critic(self.alg, state)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
+        if self.failures is not None and "failures" in state:
+            self.failures.load_state_dict(state["failures"])
+        self.iteration = state["iter"]
+        self.env_steps = state["env_steps"]
+        self._elapsed_s = state.get("elapsed_s", 0.0)
+        self.env.start_anew({"levels": stage})
         self.begun = True
-        self.critic_warmup = warmup_iterations(state)
-        self._best, self._window = None, self._new_window()
 
     def save(self) -> None:
         """Write checkpoint and policy; the policy is that of the best checkpoint.

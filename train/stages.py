@@ -1,4 +1,4 @@
-"""What ``vd-train student`` and ``vd-train alignment`` share: command line, task, and how a run begins."""
+"""What ``vd-train student`` and ``alignment`` share: command line, task, how a run begins."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -141,7 +141,7 @@ def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
 def task_of_teacher(
     teacher: "TrainedPolicy", chosen: StageTaskCfg, condition: RandomisationCfg | None = None
 ) -> ReorientCfg:
-    """The environments of a teacher's training, randomised as they were or as ``condition`` says."""
+    """The environments of a teacher's training, randomised so or as ``condition`` says."""
     from vd.policy.agents import task_for
 
     trained = ReorientCfg.of(teacher)

@@ -1,4 +1,4 @@
-"""Training by labels: one network, one optimiser, and a learning rate that falls to the end of the run."""
+"""Training by labels: one network, one optimiser, a learning rate that falls to the end."""
 
 import math
 from pathlib import Path

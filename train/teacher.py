@@ -34,7 +34,7 @@ BUILDING = "building the environments (the first start compiles the kernels: a m
 
 
 def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "TeacherRunner":
-    """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
+    """Build environment and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     ``say`` is told when the slow part begins.
 
@@ -47,7 +47,8 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
     validate(cfg.ppo, cfg.policy, cfg.run)
     cfg.env.validate()
     check_folder(cfg.run.out)
-    rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
+    rank = int(os.environ.get("RANK", "0"))
+    device = resolve_device(cfg.run.device)
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume)
     init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
     if init is not None:

@@ -47,8 +47,8 @@ class TrackerCfg(EpisodeFlags):
     """Object sets to choose the stopping rules on, not those of the training; by default
     procedural-heldout, and a few of its kinds on a CPU."""
     alignment: str | None = None
-    """Network that finds objects by their goals' points: the alignment.pt of vd-train alignment, or a
-    vision policy, for that of it: its name or file."""
+    """Network that finds objects by their goals' points: the alignment.pt of vd-train alignment, or
+    a vision policy, for that of it: its name or file."""
     out: Path = Path("tracking.safetensors")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None

@@ -151,6 +151,6 @@ class ReorientVecEnv(VecEnv):
         return levels | {"task/failed_steps": float(self.env.failed_steps())}
 
     def start_anew(self, state: dict[str, Any]) -> None:
-        """Begin new episodes in all environments, at the levels of the curriculum that a state has."""
+        """Begin new episodes in all environments, at a state's levels of the curriculum."""
         self.env.set_levels(self.env.levels_of(state))
         self.env.reset()

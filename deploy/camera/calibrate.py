@@ -59,8 +59,8 @@ class CalibrateCfg(HandOptions):
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
     pose_frame: tuple[float, float, float, float, float, float, float] | None = None
-    """Where a twin's camera is, or a real one is thought to be, in the hand's base: position [m] and
-    quaternion xyzw; by default where the hand's file has it."""
+    """Where a twin's camera is, or a real one is thought to be, in the hand's base: position [m]
+    and quaternion xyzw; by default where the hand's file has it."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before the torque goes off."""
 
@@ -158,7 +158,7 @@ def _let_go(connection: Connection, *, yes: bool) -> None:
 def views_of(
     connection: Connection, camera: "ImageSource", finger: int, size_m: float, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Poses of a fingertip in the hand's base [7], and of the cube in the camera [7], while it bends.
+    """While a finger bends, poses of its tip in the hand's base [7] and of the cube in the camera [7].
 
     Args:
         connection: The hand.
@@ -167,7 +167,9 @@ def views_of(
         size_m: Side of the cube [m].
         count: How many.
     """
-    hand, bus, joints = connection.hand, connection.bus, connection.joints
+    hand = connection.hand
+    bus = connection.bus
+    joints = connection.joints
     print(f"Bend finger {finger} all ways, the cube to the camera; hold it still now and then.")
     bent: list[np.ndarray] = []
     views: list[tuple[np.ndarray, np.ndarray]] = []

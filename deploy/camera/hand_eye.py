@@ -1,4 +1,4 @@
-"""Where a camera is, from a cube of tags on fingers of a hand that it looks at (hand-eye calibration).
+"""Where a camera is, from a cube of tags on a hand that it looks at (hand-eye calibration).
 
 With the fingertip's pose t_i in the hand's base (forward kinematics), the cube fixed to it at M,
 and the wanted pose X of the camera in the base, view i shows the cube at ``C_i = X^-1 t_i M``. From
@@ -25,8 +25,6 @@ from vd.assets_usd.hand_data import Intrinsics, compose, invert
 CONFIDENCE = 0.95
 LEAST_VIEWS = 6
 """Views below which nothing is solved: 12 unknowns with one finger, and some views to judge by."""
-LEAST_OF_FINGER = 4
-"""Views of one finger below which it only costs unknowns."""
 LEAST_TURN_RAD = 0.1
 """Root mean square turn between views, about the second of their axes, below which they determine
 no camera."""
@@ -101,7 +99,7 @@ class HandEye:
         return self.factor * np.sqrt(np.diag(self.covariance))
 
     def point_error(self, point: np.ndarray) -> float:
-        """Half of the 95 % interval of where the camera puts a point of the base [3], in the worst direction.
+        """Half of the 95 % interval of where the camera puts a point [3], in the worst direction.
 
         Metres.
         """
@@ -123,10 +121,8 @@ def solve(views: Views) -> HandEye:
     Raises:
         HandEyeError: Too few views agree, or the fingers turned about too few directions.
     """
-    rows = _enough(views.finger, np.arange(len(views)))
-    if len(rows) < LEAST_VIEWS:
-        raise HandEyeError(f"{len(rows)} views of the cube; take {LEAST_VIEWS}, better 30")
-    views = views.chosen(rows)
+    if len(views) < LEAST_VIEWS:
+        raise HandEyeError(f"{len(views)} views of the cube; take {LEAST_VIEWS}, better 30")
     camera = _by_motions(views)
     begin = {}
     for finger in np.unique(views.finger):
@@ -137,7 +133,7 @@ def solve(views: Views) -> HandEye:
     estimate = refine(views, camera, begin, robust=True)
     for _ in range(2):
         off = _off(views, estimate.camera, np.stack([estimate.cubes[int(f)] for f in views.finger]))
-        rows = _enough(views.finger, np.flatnonzero(off < INLIER_PX))
+        rows = np.flatnonzero(off < INLIER_PX)
         if len(rows) < max(LEAST_VIEWS, len(views) / 2):
             raise HandEyeError(
                 f"only {len(rows)} of {len(views)} views agree with each other; check the cube's "
@@ -157,7 +153,8 @@ def _by_motions(views: Views) -> np.ndarray:
     """
     first, second = np.triu_indices(len(views), 1)
     same = views.finger[first] == views.finger[second]
-    first, second = first[same], second[same]
+    first = first[same]
+    second = second[same]
     in_base = compose(views.tip[first], _inverse(views.tip[second]))
     in_camera = compose(views.cube[first], _inverse(views.cube[second]))
     turns = Rotation.from_quat(in_base[:, 3:])
@@ -175,11 +172,6 @@ def _by_motions(views: Views) -> np.ndarray:
 def _inverse(poses: np.ndarray) -> np.ndarray:
     """The inverse of each pose [N, 7]."""
     return np.array([invert(pose) for pose in poses])
-
-
-def _enough(finger: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Those of some rows whose finger [N] has enough of them."""
-    return rows[np.bincount(finger[rows], minlength=1)[finger[rows]] >= LEAST_OF_FINGER]
 
 
 def refine(

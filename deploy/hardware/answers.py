@@ -112,7 +112,7 @@ def read_answer(frame: bytes) -> Answer | None:
 
 
 class StateCheck:
-    """Makes states of the answers of some motors, and refuses those that cannot follow the last one."""
+    """Makes states of motors' answers, and refuses those that cannot follow the last one."""
 
     def __init__(self, ids: Sequence[int], models: Sequence[Model]):
         self._ids = tuple(ids)

@@ -21,14 +21,15 @@ STEPS = 13
 
 @functools.cache
 def aside(hand: HandModel, moving: int) -> np.ndarray:
-    """Joint angles [D] [rad] with a finger at the middle of its range and the others out of its way.
+    """Joint angles [D] [rad] with a finger in the middle of its range and the others out of its way.
 
     Each of the others has one joint aside, the first outward if that will do; it is where it
     touches nothing, or least often.
     """
     touching = _Touching(hand)
     joints = np.arange(hand.num_joints)
-    middle, half = 0.5 * (hand.lower + hand.upper), 0.5 * (hand.upper - hand.lower)
+    middle = 0.5 * (hand.lower + hand.upper)
+    half = 0.5 * (hand.upper - hand.lower)
     moves = hand.joint_finger == moving
     swept = []
     for joint in joints[moves]:
@@ -73,7 +74,7 @@ class _Touching:
         self._finger = np.concatenate([[-1], link_finger])[self._model.geom_bodyid]
 
     def __call__(self, q: np.ndarray, fingers: set[int]) -> bool:
-        """Whether links of these fingers, at joint angles [D] [rad], are near each other or in the base."""
+        """Whether links of these fingers touch each other or the base, at joint angles [D] [rad]."""
         import mujoco
 
         self._data.qpos[:] = q

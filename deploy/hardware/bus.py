@@ -241,7 +241,7 @@ class MotorBus:
         self._ask(id, f"write {value} to {name}: ", self._sdk.INST_WRITE, data)
 
     def configure(self, settings: Mapping[int, MotorSettings]) -> None:
-        """Torque off, write what differs of the registers that are ours to set, and read all of it back.
+        """Torque off, write the registers that are ours to set and differ, and read them back.
 
         Raises:
             BusError: A motor did not answer, refused, or kept another value; names each.
@@ -312,7 +312,7 @@ class MotorBus:
                 self.write(id, "bus_watchdog", max(1, round(seconds / WATCHDOG_UNIT_S)))
 
     def freeze(self) -> None:
-        """Have the motors stop by themselves where they are, without an answer, within two units of silence.
+        """Have the motors stop where they are, without an answer, within two units of silence.
 
         The shortest bus watchdog, in one packet: what a line that brings no states still can do.
         """

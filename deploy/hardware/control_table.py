@@ -1,4 +1,4 @@
-"""Control tables of DYNAMIXEL X motors (ROBOTIS e-manual, one page a model), as typed data, and their units.
+"""Control tables of DYNAMIXEL X motors (ROBOTIS e-manual, one page a model), and their units.
 
 The models share addresses and differ in units and limits. Angles in radians with zero in the middle
 of the range, velocities in rad/s, currents in A.
@@ -36,7 +36,8 @@ FULL_PWM = 885
 WATCHDOG_UNIT_S = 0.02
 """Unit of the bus watchdog."""
 WATCHDOG_TRIPPED = -1
-"""Value of the bus watchdog of a motor that it has stopped: goals are refused until 0 is written."""
+"""Value of the bus watchdog of a motor that it has stopped: goals are refused until 0 is
+written."""
 WATCHDOG_FIRMWARE = 38
 """First firmware that has a bus watchdog; the XL330 and XC330 had it from their first one on."""
 TICK_MODULUS = 32768

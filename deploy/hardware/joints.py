@@ -135,7 +135,8 @@ class JointMotors:
         currents = self.currents()
         result = {}
         for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
-            low, high = float(ends[0, axis]), float(ends[1, axis])
+            low = float(ends[0, axis])
+            high = float(ends[1, axis])
             if low < first or high > last:
                 raise CalibrationError(
                     f"{self.names[axis]}, motor {motor.id}: its range is {low:.2f} to {high:.2f} "

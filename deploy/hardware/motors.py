@@ -22,7 +22,7 @@ class Motors(Protocol):
         """The newest state, asked for again so often where no sound one came."""
 
     def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
-        """Send goals [rad], at once or together with the question of the next :meth:`read_state`."""
+        """Send goals [rad], at once or with the question of the next :meth:`read_state`."""
 
     def freeze(self) -> None:
         """Have the motors stop where they are, though nobody knows where that is."""

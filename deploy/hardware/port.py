@@ -41,7 +41,7 @@ def sdk() -> ModuleType:
 
 
 def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
-    """A serial port as the SDK takes it, locked for this process until it is closed or the process ends.
+    """A serial port as the SDK takes it, locked for this process until it is closed.
 
     Args:
         path: Device, such as /dev/ttyUSB0.

@@ -126,7 +126,7 @@ def _finger(joint: str) -> str:
 
 
 def _of_hand(motion: "Trajectory", motors: "JointMotors") -> "Trajectory":
-    """A motion with the fingers aside that it does not move, and the usual gain if it names none."""
+    """A motion with the other fingers aside, and the usual gain if it names none."""
     hand = motors.hand
     command = motion.command.copy()
     moving = hand.joint_finger[hand.joint_names.index(motion.joints[0])]
@@ -223,7 +223,7 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 def play(
     safe: SafeHand, motion: "Trajectory", columns: Sequence[int], rate_hz: float
 ) -> "Trajectory":
-    """Go to where a motion starts, play it on an armed hand, and give what was measured of some joints.
+    """Play a motion from its start on an armed hand, and give what was measured of some joints.
 
     Raises:
         StoppedError: The hand was stopped.

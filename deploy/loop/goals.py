@@ -1,4 +1,4 @@
-"""What to reach: the shape of an object, from its USD or any scan, and the orientations it shall take.
+"""What to reach: an object's shape, from its USD or any scan, and orientations for it.
 
 A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface
 is laid through it, by which a tracking policy finds the object; it need not be closed before, as
@@ -196,7 +196,8 @@ def _surface(path: Path, generator: np.random.Generator) -> Surface:
 
 def _unit(path: Path, longest: float) -> float:
     """Factor from the scan's unit to metres."""
-    low, high = LONGEST_SIDE_M[0] / LARGER, LONGEST_SIDE_M[1] * LARGER
+    low = LONGEST_SIDE_M[0] / LARGER
+    high = LONGEST_SIDE_M[1] * LARGER
     fitting = [UNITS_M[name] for name in GUESSED_UNITS if low <= longest * UNITS_M[name] <= high]
     if not fitting:
         raise GoalError(

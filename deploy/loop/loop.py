@@ -1,4 +1,4 @@
-"""The control loop: one process, 12 Hz on a monotonic clock, from senses to goals, its lateness measured.
+"""The control loop: from senses to goals, 12 Hz on a monotonic clock, its lateness measured.
 
 One step is :meth:`ControlLoop.step`: wait, sense, decide, filter, send, log.
 """
@@ -288,7 +288,7 @@ class ControlLoop:
 
 
 def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
-    """Median, 99th percentile and most of each of the times [ms], and of the two latencies of training.
+    """Median, 99th percentile and most of each time [ms], and of the two latencies of training.
 
     ``observation_latency_ms`` is how old the image is when the joints are read,
     ``command_delay_ms`` how much later goals are sent (``randomisation.observation_latency_s``;

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
@@ -218,7 +217,7 @@ class CameraRunner(PolicyRunner):
         )
         if isinstance(self._policy, TrackingPolicy):
             self._tracker: Any = Tracker(self._policy, self._hand, [self._item], camera)
-            self._library = library_of(self._policy.teacher.network.offset)
+            self._library: Any = library_of(self._policy.teacher.network.offset)
             return
         import torch
 
@@ -234,8 +233,21 @@ class CameraRunner(PolicyRunner):
 
     def decide(self, sensed: Sensed) -> PolicyDecision:
         """Mean action, and the expected distance."""
-        points = seen_points(self.eye, sensed.depth)
-        senses = senses_of(sensed, of_warp(points, self._library), fresh=self._fresh)
+        if sensed.depth is None:
+            raise ValueError("the policy sees by a depth camera, but there is no image")
+        xp = self._library
+
+        def row(values: np.ndarray) -> Array:
+            return xp.asarray(values, dtype=xp.float32, copy=True)[None]
+
+        senses = Senses(
+            joint_q=row(sensed.joint_q),
+            joint_qd=row(sensed.joint_qd),
+            action=row(sensed.smoothed),
+            goal_quat=row(sensed.goal_quat),
+            points=of_warp(self.eye.seen(sensed.depth), xp),
+            fresh=xp.asarray([self._fresh]),
+        )
         decided = self._tracker.step(senses)
         self._fresh = False
         place = [np.asarray(decided.position[0]), np.asarray(decided.orientation[0])]
@@ -285,40 +297,4 @@ def load_runner(
     raise ValueError(
         f"{name} is a teacher: it needs the object's pose, which no robot senses. Tell it by "
         "--pose, or have vd-train tracker make a tracking policy of it"
-    )
-
-
-def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> wp.array:
-    """What a camera sees in an image, base frame [m], NaN for none [1, K].
-
-    Overwritten by the next call.
-
-    Raises:
-        ValueError: There is no image.
-    """
-    if depth is None:
-        raise ValueError("the policy sees by a depth camera, but there is no image")
-    return cloud.seen(depth)
-
-
-def senses_of(sensed: Sensed, points: Array, *, fresh: bool = False) -> Senses:
-    """What a policy that sees by a camera is told of one hand.
-
-    Args:
-        sensed: What is known.
-        points: What its camera sees [1, K, 3].
-        fresh: Whether an episode begins.
-    """
-    xp = library_of(points)
-
-    def row(values: np.ndarray) -> Array:
-        return xp.asarray(values, dtype=xp.float32, copy=True)[None]
-
-    return Senses(
-        joint_q=row(sensed.joint_q),
-        joint_qd=row(sensed.joint_qd),
-        action=row(sensed.smoothed),
-        goal_quat=row(sensed.goal_quat),
-        points=points,
-        fresh=xp.asarray([fresh]),
     )

@@ -98,7 +98,7 @@ def ending(log: HandLog) -> list[str]:
 
 
 def write_page(log: HandLog, results: Sequence[GoalResult], *, filmed: bool = True) -> Path:
-    """Write the film of a run, if the extra ``video`` is there, and the page that shows it, into its folder.
+    """Write the film of a run, if the extra ``video`` is there, and the page that shows it.
 
     Args:
         log: Of the run.

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from vd.evaluate.statistics import (
     TOLERANCES_RAD,
-    Interval,
     median_interval,
     rate_intervals,
     symmetric_error,
@@ -61,66 +60,18 @@ class ScoreCfg:
     log: Annotated[Path, tyro.conf.Positional]
     """Folder of the log of vd-deploy."""
     mocap: Path
-    """Export of the motion capture: CSV with time [s], x, y, z [m], qx, qy, qz, qw, and tracked (1 or
-    0) if it likes; empty cells where markers were lost."""
+    """Export of the motion capture: CSV with time [s], x, y, z [m], qx, qy, qz, qw, and tracked (1
+    or 0) if it likes; empty cells where markers were lost."""
     offset_s: float | None = None
     """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop.
     By default times are seconds since 1970."""
     world: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Turn from the motion capture's frame to the hand's world frame (z up), quaternion xyzw; 0.707 0
-    0 0.707 where y points up."""
+    """Turn from the motion capture's frame to the hand's world frame (z up), quaternion xyzw; 0.707
+    0 0 0.707 where y points up."""
     marker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined
     on it.
     """
-
-
-@dataclass(frozen=True)
-class Trial:
-    """The pursuit of one goal."""
-
-    goal: int
-    """Number of the goal."""
-    time_s: float
-    """When it ended [s], since the start of the log."""
-    outcome: str
-    """How it ended."""
-    tracked: bool
-    """Whether the object was tracked at its end."""
-    error_rad: float | None
-    """Angle to the goal at the stop [rad]; None without a stop, or if the object was not
-    tracked.
-    """
-    predicted_rad: float | None
-    """What the policy predicted [rad]."""
-
-    @property
-    def discarded(self) -> bool:
-        """Whether it cannot be scored: it stopped, but nobody knows where."""
-        return self.outcome == "stopped" and not self.tracked
-
-
-@dataclass(frozen=True, eq=False)
-class Score:
-    """A scored run."""
-
-    log: Path
-    """The run."""
-    mocap: Path
-    """Its motion capture."""
-    offset_s: float
-    """Time of the export at the log's beginning [s]."""
-    trials: tuple[Trial, ...]
-    """Every goal that ended."""
-    median: Interval | None
-    """Of the errors at the stops [rad]."""
-    within: tuple[tuple[float, Interval], ...]
-    """Share of the trials that stopped within each tolerance [rad], the discarded ones apart."""
-
-    @property
-    def scored(self) -> int:
-        """Trials that were not discarded."""
-        return sum(not trial.discarded for trial in self.trials)
 
 
 def score(cfg: ScoreCfg) -> int:
@@ -130,9 +81,9 @@ def score(cfg: ScoreCfg) -> int:
     log = read_log(cfg.log)
     symmetry = one_object(log.run["object"]["set"]).symmetry
     mocap = in_world(read_mocap(cfg.mocap), world=cfg.world, marker=cfg.marker)
-    result = score_run(log, mocap, symmetry, offset_s=cfg.offset_s)
-    print("\n".join(lines(result)))
-    return 0 if result.scored else 1
+    errors = stop_errors(log, mocap, symmetry, offset_s=cfg.offset_s)
+    print("\n".join(lines(log, errors)))
+    return 1 if np.isnan(errors).all() else 0
 
 
 def read_mocap(path: Path) -> Mocap:
@@ -179,10 +130,13 @@ def in_world(mocap: Mocap, *, world: tuple[float, ...], marker: tuple[float, ...
     return replace(mocap, pose=pose)
 
 
-def score_run(
+def stop_errors(
     log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: float | None = None
-) -> Score:
-    """Score a run.
+) -> np.ndarray:
+    """Angle to the goal at the end of each pursuit of a run [rad], in the order of ``log.stops``.
+
+    Infinite where the policy did not say that it arrived, NaN where it did, but the object was not
+    tracked.
 
     Args:
         log: The run.
@@ -196,59 +150,51 @@ def score_run(
     """
     if offset_s is None:
         offset_s = float(log.run["unix_s"])
-    mocap = replace(mocap, time_s=mocap.time_s - offset_s)
+    time_s = mocap.time_s - offset_s
     end = log.columns["t"][-1]
-    if mocap.time_s[-1] < 0.0 or mocap.time_s[0] > end:
+    if time_s[-1] < 0.0 or time_s[0] > end:
         raise MocapError(
-            f"{mocap.path} covers {mocap.time_s[0]:.1f} to {mocap.time_s[-1]:.1f} s of the log's "
-            f"time, the log 0 to {end:.1f} s; name the clocks' offset with --offset-s, or export "
-            "the right take"
+            f"{mocap.path} covers {time_s[0]:.1f} to {time_s[-1]:.1f} s of the log's time, the log "
+            f"0 to {end:.1f} s; name the clocks' offset with --offset-s, or export the right take"
         )
-    trials = []
-    for stop in log.stops:
-        row = int(np.argmin(np.abs(np.where(mocap.tracked, mocap.time_s, np.inf) - stop.time_s)))
-        tracked = bool(mocap.tracked[row] and abs(mocap.time_s[row] - stop.time_s) <= NEAR_S)
-        error = None
-        if tracked and stop.outcome == "stopped":
-            error = float(symmetric_error(mocap.pose[row, 3:], np.array(stop.goal_quat), symmetry))
-        trials.append(Trial(stop.goal, stop.time_s, stop.outcome, tracked, error, stop.distance))
-    kept = [trial.error_rad for trial in trials if not trial.discarded]
-    errors = np.array([np.inf if error is None else error for error in kept])
-    stop_errors = errors[np.isfinite(errors)]
-    within = errors <= np.array(TOLERANCES_RAD)[:, None]
-    rates = rate_intervals(within[:, None, :], "episode") if kept else []
-    return Score(
-        log.path,
-        mocap.path,
-        offset_s,
-        tuple(trials),
-        median_interval(stop_errors[None], "episode") if len(stop_errors) else None,
-        tuple(zip(TOLERANCES_RAD, rates, strict=False)),
-    )
+    tracked_s = np.where(mocap.tracked, time_s, np.inf)
+    errors = np.full(len(log.stops), np.inf)
+    for number, stop in enumerate(log.stops):
+        if stop.outcome != "stopped":
+            continue
+        away_s = np.abs(tracked_s - stop.time_s)
+        row = int(np.argmin(away_s))
+        errors[number] = np.nan
+        if away_s[row] <= NEAR_S:
+            goal = np.array(stop.goal_quat)
+            errors[number] = symmetric_error(mocap.pose[row, 3:], goal, symmetry)
+    return errors
 
 
-def lines(result: Score) -> list[str]:
-    """The score as text."""
+def lines(log: HandLog, errors: np.ndarray) -> list[str]:
+    """What :func:`stop_errors` gave for a run, as text."""
     rows = ["goal  ended at  outcome     error  predicted"]
-    for trial in result.trials:
-        error = "lost" if trial.discarded else _degrees(trial.error_rad)
+    for stop, error in zip(log.stops, errors, strict=True):
+        shown = "lost" if np.isnan(error) else _degrees(error)
         rows.append(
-            f"{trial.goal + 1:4d}  {trial.time_s:6.1f} s  {trial.outcome:<10}  {error:>5}  "
-            f"{_degrees(trial.predicted_rad):>9}"
+            f"{stop.goal + 1:4d}  {stop.time_s:6.1f} s  {stop.outcome:<10}  {shown:>5}  "
+            f"{_degrees(stop.distance):>9}"
         )
-    discarded = len(result.trials) - result.scored
+    scored = errors[~np.isnan(errors)]
     rows.append(
-        f"{result.scored} trials scored, {discarded} discarded since the markers were lost at the "
-        f"stop"
+        f"{len(scored)} trials scored, {len(errors) - len(scored)} discarded since the markers were "
+        "lost at the stop"
     )
-    if result.median is not None:
-        m = result.median
-        stops = sum(trial.error_rad is not None for trial in result.trials)
+    at_stops = scored[np.isfinite(scored)]
+    if len(at_stops):
+        m = median_interval(at_stops[None], "episode")
         rows.append(
-            f"median error at {stops} stops: {m.value:.2f} rad ({np.degrees(m.value):.0f} deg), "
-            f"95 % {m.low:.2f} to {m.high:.2f}"
+            f"median error at {len(at_stops)} stops: {m.value:.2f} rad "
+            f"({np.degrees(m.value):.0f} deg), 95 % {m.low:.2f} to {m.high:.2f}"
         )
-    for tolerance, share in result.within:
+    within = scored <= np.array(TOLERANCES_RAD)[:, None]
+    shares = rate_intervals(within[:, None, :], "episode") if len(scored) else []
+    for tolerance, share in zip(TOLERANCES_RAD, shares, strict=False):
         rows.append(
             f"within {tolerance:.1f} rad: {100 * share.value:3.0f} %, 95 % {100 * share.low:.0f} "
             f"to {100 * share.high:.0f} % of all that were scored"

@@ -69,8 +69,8 @@ class SafetyCfg:
     stale_s: float = 3.0 * PERIOD_S
     """Age [s] of the newest image at which the hand is stopped, once there was one."""
     pose_stale_s: float = 1.0
-    """Age [s] of the newest pose of --pose at which the hand is stopped: for less long the object may
-    be behind a finger, and a tracker of 10 Hz that drops one is 0.35 s old."""
+    """Age [s] of the newest pose of --pose at which the hand is stopped: for less long the object
+    may be behind a finger, and a tracker of 10 Hz that drops one is 0.35 s old."""
     watchdog_s: float = 0.3
     """Silence [s] after which the motors stop by themselves; 0 for never. Above three control
     periods.
@@ -123,7 +123,8 @@ class Limits:
         hand = joints.hand
         self._names = tuple(names)
         self._cfg = cfg
-        self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
+        self.lower = hand.lower + cfg.margin_rad
+        self.upper = hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(
                 f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider"
@@ -138,7 +139,7 @@ class Limits:
         self._weak = Lasting(cfg.current_s)
 
     def goal(self, target: np.ndarray, here: np.ndarray) -> np.ndarray:
-        """The goal in range nearest to the target, but never far from where the joints are, all [D].
+        """The goal in range nearest to the target, but never far from the joints, all [D].
 
         A joint that is out of its range is brought back by steps.
         """

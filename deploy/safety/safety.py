@@ -79,7 +79,10 @@ LEFT_ON = "it holds, as --safety.then says"
 
 
 class StoppedError(RuntimeError):
-    """The hand was stopped; the message says why, ``signal`` which one asked for it, 0 for another reason."""
+    """The hand was stopped.
+
+    The message says why, ``signal`` which one asked for it, 0 for another reason.
+    """
 
     def __init__(self, reason: str, number: int = 0):
         super().__init__(reason)
@@ -230,7 +233,10 @@ class SafeHand:
             )
 
     def read(self) -> HandState:
-        """Read the joints; for a short gap in the bus the last state once more, with its own time."""
+        """Read the joints.
+
+        For a short gap in the bus the last state once more, with its own time.
+        """
         self._check()
         try:
             state = self._read()
@@ -269,28 +275,23 @@ class SafeHand:
                 raise self.stop(unheard(error), lost=True) from error
         return goal
 
-    def move(self, goal: np.ndarray, speed: float) -> np.ndarray:
+    def move(self, goal: np.ndarray, speed: float) -> None:
         """Move slowly in a straight line of joint angles, and wait for the hand to follow.
 
         Args:
             goal: Angles of the joints [rad], shape [D].
             speed: Of the joint that has farthest to go [rad/s].
-
-        Returns:
-            The largest distance of each joint from where it should have been [rad], shape [D].
         """
         start = self.read().position
         steps = max(1, math.ceil(float(np.abs(goal - start).max()) / (speed * MOVE_S)))
-        worst = np.zeros(len(start))
         clock = self.bus.clock
         begin = clock.now()
         for step in range(1, steps + SETTLE_STEPS + 1):
             target = start + (goal - start) * min(1.0, step / steps)
             self.command(target)
             clock.sleep(begin + step * MOVE_S - clock.now())
-            worst = np.maximum(worst, np.abs(self.read().position - target))
+            self.read()
             self.beat()
-        return worst
 
     def switch(self, on: np.ndarray) -> None:
         """Switch the torque of joints on or off; one that is switched on stays where it is.
@@ -385,7 +386,7 @@ class SafeHand:
             )
 
     def _errors(self, which: np.ndarray, otherwise: str) -> str:
-        """What some motors [D] bool report as their errors, and what is said of one that reports none."""
+        """What some motors [D] bool report as their errors, and otherwise what is said of them."""
         try:
             errors = self.bus.hardware_errors()
         except BusError:
@@ -450,14 +451,20 @@ class SafeHand:
         self._tell(lambda: self.bus.write_goals(goals))
 
     def _tell(self, send: Callable[[], None]) -> None:
-        """Tell the motors to hold, and note when; a line that takes nothing is told of at the end."""
+        """Tell the motors to hold, and note when.
+
+        A line that takes nothing is told of at the end.
+        """
         assert self.report is not None
         with contextlib.suppress(BusError):
             send()
             self.report = replace(self.report, held_s=self.report.held_s or self.bus.clock.now())
 
     def _off(self) -> None:
-        """Settle where the hand came to rest, then torque off as configured; the first caller does it."""
+        """Settle where the hand came to rest, then torque off as configured.
+
+        The first caller does it.
+        """
         with self._ending:
             if self._ends:
                 return

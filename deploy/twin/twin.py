@@ -150,7 +150,7 @@ class Twin(FaultlessMotors):
         """Put the object where an episode starts; it falls from there."""
         with self._lock:
             self._catch_up()
-            self.hand.place_object((0.0, 0.0, 0.0, 1.0))
+            self.hand.place_object()
 
     def render(self, camera: DepthCamera) -> Frame:
         """A depth image of the present."""
@@ -170,12 +170,11 @@ class TwinCamera:
     """
 
     def __init__(self, twin: Twin, place: CameraModel, *, realistic: bool = False):
-        assert twin.hand.scene is not None, "there is nothing to see without an object"
         sensor = DepthSensorCfg.realistic() if realistic else DepthSensorCfg()
         self.intrinsics = place
         self._twin = twin
         self._camera = DepthCamera.of_scene(
-            twin.hand.scene, twin.hand.body_q, DepthCameraCfg(points=0, sensor=sensor), place
+            twin.hand.scene, twin.hand.sim.body_q, DepthCameraCfg(points=0, sensor=sensor), place
         )
 
     def read(self, timeout_s: float) -> Frame:

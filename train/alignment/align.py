@@ -14,15 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vd.assets_usd.objects.model import ObjectModel
 from vd.command.config import to_dict
 from vd.paper import PAPER
 from vd.train.alignment.config import ALIGNMENT_NAME, AlignCfg
 from vd.train.alignment.looks import SimulatedLooks
 from vd.train.checkpoint import save_checkpoint
 from vd.train.config import RunCfg
-from vd.train.student.bank import ShapeBank, centred_points
-from vd.train.student.shapes import made_shapes
+from vd.train.student.bank import ShapeBank
 from vd.train.student.views import Hands, Pairs, draw_pairs, joined
 from vd.train.supervised import SupervisedLoop
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
@@ -35,8 +33,6 @@ OFFSET_WEIGHT = 10.0
 """Of the offset [1/m]: a centimetre counts as 0.1 rad, which moves the surface by about as much."""
 WITHIN_RAD = (PAPER.success.rotation_rad, PAPER.success.precise_rad)
 """Errors within which the paper counts a goal as reached."""
-UNSEEN_SHAPES = 64
-"""Made shapes that are never trained on."""
 NEAR_SHARE = 0.5
 """Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
 SCAN_SHARE = 0.25
@@ -48,40 +44,8 @@ SIMULATED_SHARE = 0.5
 """Stage 1: share of pairs that are of what was seen in simulation; others are made."""
 
 
-class Scenes:
-    """Where pairs come from.
-
-    Args:
-        objects: Objects to learn from, deformed.
-        held_out: Objects to measure on, as they are; may be none.
-        hands: What hides shapes.
-        cfg: Settings.
-
-    Attributes:
-        bank: What is learned from.
-        hands: What hides it.
-        held_out: Shapes that are only measured, by name of the set: points [m] and normals
-            [O, P, 6].
-    """
-
-    def __init__(
-        self,
-        objects: Sequence[ObjectModel],
-        held_out: Sequence[ObjectModel],
-        hands: Hands,
-        cfg: AlignCfg,
-    ) -> None:
-        device = hands.eye.device
-        points = CLOUDS * cfg.points
-        self.hands = hands
-        self.held_out = {"made": made_shapes(UNSEEN_SHAPES, points, device)}
-        if held_out:
-            self.held_out["validation"] = centred_points(held_out, points, device)
-        self.bank = ShapeBank(objects, cfg.shapes, points, device)
-
-
 def alignment_losses(residual: Residual, pairs: Pairs) -> tuple[dict[str, Tensor], Tensor]:
-    """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
+    """Losses by name, means over the batch, and errors of the rotations [rad] [B]."""
     wrong = residual.rotation.detach().mT @ pairs.rotation
     error = turn_angle(wrong)
     losses = {
@@ -98,7 +62,10 @@ class AlignTrainer(SupervisedLoop):
     are begun anew.
 
     Args:
-        scenes: Where made pairs come from.
+        bank: Shapes to learn from.
+        held_out: Shapes that are only measured, by name of the set: points [m] and normals
+            [O, P, 6].
+        hands: What hides shapes.
         network: The network.
         cfg: Settings.
         run: Run settings.
@@ -113,7 +80,9 @@ class AlignTrainer(SupervisedLoop):
 
     def __init__(
         self,
-        scenes: Scenes,
+        bank: ShapeBank,
+        held_out: dict[str, Tensor],
+        hands: Hands,
         network: AlignmentNetwork,
         cfg: AlignCfg,
         run: RunCfg,
@@ -131,7 +100,9 @@ class AlignTrainer(SupervisedLoop):
             task=task,
             device=device,
         )
-        self.scenes = scenes
+        self.bank = bank
+        self.held_out = held_out
+        self.hands = hands
         self.cfg = cfg
         self.looks = looks
         self.spec = spec
@@ -150,7 +121,7 @@ class AlignTrainer(SupervisedLoop):
                 return None
             acted = self._read(collected)
         if self.iteration:
-            self.scenes.bank.renew(self.cfg.fresh_shapes)
+            self.bank.renew(self.cfg.fresh_shapes)
         done = self._done()
         steps = []
         for _ in range(self.cfg.steps):
@@ -164,8 +135,8 @@ class AlignTrainer(SupervisedLoop):
         points = self.cfg.points
         shares = {"near": NEAR_SHARE, "scans": SCAN_SHARE}
         simulated = 0 if self.looks is None else round(SIMULATED_SHARE * self.cfg.batch)
-        shapes = self.scenes.bank.draw(self.cfg.batch - simulated)
-        made = draw_pairs(self.scenes.hands, shapes, points, **shares)
+        shapes = self.bank.draw(self.cfg.batch - simulated)
+        made = draw_pairs(self.hands, shapes, points, **shares)
         if self.looks is None:
             return made
         return joined(made, self.looks.pairs(simulated, points, **shares))
@@ -211,7 +182,7 @@ class AlignTrainer(SupervisedLoop):
         Medians are means of the processes' medians.
         """
         figures = {}
-        for name, shapes in self.scenes.held_out.items():
+        for name, shapes in self.held_out.items():
             processes = self.world_size * (4 if name == "made" else 1)
             views = shapes.repeat(max(1, self.cfg.views // processes), 1, 1)
             for kind, scans in (("", 0.0), ("_scans", 1.0)):
@@ -227,7 +198,7 @@ class AlignTrainer(SupervisedLoop):
         errors = []
         offsets = []
         for some in shapes.split(max(1, self.cfg.batch // 8)):
-            pairs = draw_pairs(self.scenes.hands, some, self.cfg.points, scans=scans)
+            pairs = draw_pairs(self.hands, some, self.cfg.points, scans=scans)
             alignment = Aligner(self.network, pairs.goal).look(pairs.seen)
             errors.append(turn_angle(alignment.rotation.mT @ pairs.rotation))
             offsets.append((alignment.position - pairs.offset).norm(dim=-1))

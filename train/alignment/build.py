@@ -13,22 +13,29 @@ from vd.envs.reorient import ReorientEnv
 from vd.policy.actor import TrainedPolicy
 from vd.policy.contract import TrackingSpec
 from vd.tracking.policy import TrackingPolicy
-from vd.train.alignment.align import CLOUDS, AlignTrainer, Scenes
+from vd.train.alignment.align import CLOUDS, AlignTrainer
 from vd.train.alignment.config import SIMULATED, AlignmentTrainCfg
 from vd.train.alignment.looks import SimulatedLooks
 from vd.train.alignment.network import open_network
 from vd.train.stages import build_stage, task_of_teacher
-from vd.train.student.bank import mesh_points
+from vd.train.student.bank import ShapeBank, centred_points, mesh_points
+from vd.train.student.shapes import made_shapes
 from vd.train.student.views import Hands
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.saved import AlignmentSpec
 
+UNSEEN_SHAPES = 64
+"""Made shapes that are never trained on."""
+
 
 def build_alignment(
     cfg: AlignmentTrainCfg, *, say: Callable[[str], object] = print
 ) -> AlignTrainer:
-    """Build network, shapes and environments as ``cfg`` says; as :func:`vd.train.stages.build_stage`."""
+    """Build network, shapes and environments as ``cfg`` says.
+
+    As :func:`vd.train.stages.build_stage`.
+    """
     return build_stage(cfg, "alignment", network_of=_network, trainer_of=_trainer, say=say)
 
 
@@ -49,8 +56,12 @@ def _trainer(
     task = replace(task, observation=ObservationCfg())  # who sees by a camera does not look at it
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
     hands = Hands(hand, cfg.align.hands, camera=cfg.camera, device=device)
-    held_out = load_set(cfg.task.validation) if cfg.task.validation else []
-    scenes = Scenes(load_set(task.objects), held_out, hands, cfg.align)
+    points = CLOUDS * cfg.align.points
+    place = hands.eye.device
+    held_out = {"made": made_shapes(UNSEEN_SHAPES, points, place)}
+    if cfg.task.validation:
+        held_out["validation"] = centred_points(load_set(cfg.task.validation), points, place)
+    bank = ShapeBank(load_set(task.objects), cfg.align.shapes, points, place)
     spec = AlignmentSpec(
         network=network.cfg, points=cfg.align.points, hand=task.hand, camera=cfg.camera
     )
@@ -58,7 +69,9 @@ def _trainer(
     if cfg.stage == SIMULATED:
         looks = _looks(cfg, task, teacher, network, device)
     return AlignTrainer(
-        scenes,
+        bank,
+        held_out,
+        hands,
         network,
         cfg.align,
         cfg.run,

@@ -101,8 +101,8 @@ class AlignmentTrainCfg:
     """0: learn to turn a goal's cloud onto a seen one, without simulation; 1: also from what a
     depth camera sees while the teacher acts by the network of --init."""
     teacher: str | None = None
-    """Policy that acts, also the source of hand and task: a policy.safetensors, a run's folder, or the name
-    of an installed one; dclaw4 by default."""
+    """Policy that acts, also the source of hand and task: a policy.safetensors, a run's folder, or
+    the name of an installed one; dclaw4 by default."""
     init: Path | None = None
     """Network to begin from, the alignment.pt of a run or an installed vision policy. Of stage 1 by
     default that of runs/alignment/stage0, or the one that is installed for the hand."""

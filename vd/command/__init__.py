@@ -1,1 +1,1 @@
-"""What every command stands on: its line, configuration, files and pages, processes and how they end."""
+"""What every command stands on: line, configuration, files, pages, processes and their end."""

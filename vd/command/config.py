@@ -1,4 +1,4 @@
-"""Typed configurations to and from plain dictionaries (JSON, checkpoints), checked field by field."""
+"""Typed configurations to and from plain dictionaries, checked field by field."""
 
 import dataclasses
 import difflib
@@ -6,7 +6,6 @@ import math
 import types
 import typing
 from collections.abc import Iterator, Mapping, MutableMapping
-from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,8 +28,6 @@ def to_dict(value: Any) -> Any:
         return [to_dict(item) for item in value]
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, Enum):
-        return value.value
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"a configuration cannot hold a {type(value).__name__}: {value!r}")
@@ -81,7 +78,7 @@ def needed(cls: type) -> set[str]:
 
 
 def _meant(name: str, names: set[str], hints: Mapping[str, Any]) -> str:
-    """Asks for the field that ``name`` is likely meant to be, one of a group or one that is spelled alike."""
+    """Asks for the field that ``name`` may mean, one of a group or one that is spelled alike."""
     for group in sorted(names):
         kind = hints[group]
         if dataclasses.is_dataclass(kind) and name in {f.name for f in dataclasses.fields(kind)}:
@@ -106,8 +103,8 @@ def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:
         return _convert(args[0], value, where, over)
     if origin in (typing.Union, types.UnionType):
         return _convert_union(args, value, where, over)
-    if origin in (tuple, list):
-        return _convert_sequence(origin, args, value, where)
+    if origin is tuple:
+        return _convert_tuple(args, value, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         named = _mapping(value, f"fields of {hint.__name__}", where)
         return from_dict(hint, named, where=where, over=over if isinstance(over, hint) else None)
@@ -128,27 +125,21 @@ def _mapping(value: Any, wanted: str, where: str) -> Mapping[str, Any]:
     return value
 
 
-def _convert_sequence(kind: Any, args: tuple[Any, ...], value: Any, where: str) -> Any:
-    """``value`` as a list or tuple of what ``args`` say."""
+def _convert_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    """``value`` as a tuple of what ``args`` say."""
     if not isinstance(value, (list, tuple)):
         raise ValueError(f"{where}: expected a list, [{value!r}]")
-    inner = [args[0]] * len(value) if kind is list or args[-1:] == (Ellipsis,) else list(args)
+    inner = args[:1] * len(value) if args[-1:] == (Ellipsis,) else args
     if len(inner) != len(value):
         raise ValueError(f"{where}: expected {len(inner)} values, got {len(value)}")
     pairs = enumerate(zip(inner, value, strict=True))
-    return kind(_convert(each, item, f"{where}[{i}]") for i, (each, item) in pairs)
+    return tuple(_convert(each, item, f"{where}[{i}]") for i, (each, item) in pairs)
 
 
 def _convert_plain(kind: type, value: Any, where: str) -> Any:
-    """``value`` as a number, text, path or enumeration."""
+    """``value`` as a number, text or path."""
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if issubclass(kind, Enum):
-        try:
-            return kind(value)
-        except ValueError as error:
-            options = ", ".join(repr(option.value) for option in kind)
-            raise ValueError(f"{where}: {value!r} is not one of {options}") from error
     if kind is Path and isinstance(value, str):
         return Path(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
@@ -172,7 +163,7 @@ def _convert_union(options: tuple[Any, ...], value: Any, where: str, over: Any) 
 
 
 def leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Plain values of nested dictionaries and lists by their path, such as ``hand.upper_rad[3]``."""
+    """Plain values of nested dictionaries and lists by path, such as ``hand.upper_rad[3]``."""
     if isinstance(values, Mapping):
         for key, item in values.items():
             yield from leaves(item, f"{where}.{key}" if where else str(key))

@@ -10,7 +10,7 @@ import os
 import shlex
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -156,9 +156,9 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: Path, value: Any, default: Callable[[Any], Any] | None = None) -> None:
+def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as indented JSON to ``path`` atomically. NaN and infinity are refused."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False, default=default) + "\n")
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def _nearest(path: Path) -> Path:

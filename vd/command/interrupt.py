@@ -1,4 +1,4 @@
-"""What all commands do: say at once that they start, report an error in a line, and end by a signal.
+"""What all commands do: say that they start, report an error in a line, end by a signal.
 
 The exit status is then 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM, and 129
 once the terminal is gone.

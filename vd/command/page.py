@@ -1,4 +1,4 @@
-"""Self-contained HTML pages from the templates in ``vd/command/templates``: one file that needs no network.
+"""Self-contained HTML pages, each one file, from the templates in ``vd/command/templates``.
 
 A page extends ``base.html`` and takes its parts from ``macros.html``. Templates get plain data and
 escape all text. Pictures and videos are embedded as base64, and there is no script: a page can be
@@ -40,7 +40,7 @@ def write_html(path: Path, template: str, **data: Any) -> None:
 
 @cache
 def environment() -> Environment:
-    """The templates, with the filters ``cell`` (a table's cell) and ``embed`` (a picture or video)."""
+    """The templates, with filters ``cell`` (a table's cell) and ``embed`` (a picture, a video)."""
     templates = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,

@@ -1,4 +1,4 @@
-"""Warp without the lines that would scroll everything else away, and without gradients that nobody takes."""
+"""Warp without lines that scroll everything else away, and gradients that nobody takes."""
 
 import ctypes
 import os

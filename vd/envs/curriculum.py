@@ -40,11 +40,6 @@ def moving_levels(cfg: ReorientCfg) -> dict[str, LevelCfg]:
     return moving
 
 
-def first_levels(moving: dict[str, LevelCfg]) -> Levels:
-    """Where a run begins."""
-    return Levels(**dict.fromkeys(moving, 0.0))
-
-
 def next_levels(levels: Levels, success_rate: float, moving: dict[str, LevelCfg]) -> Levels:
     """The levels after an update: at most one of them moves.
 
@@ -65,12 +60,6 @@ def next_levels(levels: Levels, success_rate: float, moving: dict[str, LevelCfg]
                 return replace(levels, **{name: max(0.0, values[name] - level.rate)})
             break
     return levels
-
-
-def progress_of(levels: Levels, moving: dict[str, LevelCfg]) -> float:
-    """How far all levels that move have come together, in [0, 1]."""
-    values = asdict(levels)
-    return sum(values[name] for name in moving) / len(moving) if moving else 1.0
 
 
 def blend(loose: Any, tight: Any, level: float) -> Any:

@@ -27,7 +27,8 @@ class Fingers:
     """
 
     def __init__(self, hand: HandModel, scene: Scene, sim: Simulator):
-        self._sim, device = sim, sim.joint_q.device
+        self._sim = sim
+        device = sim.joint_q.device
         self.tip_body = wp.array(scene.link_body[hand.tip_link], dtype=wp.int32, device=device)
         self.tip_offset = wp.array(hand.tip_frame, dtype=wp.transform, device=device)
         self._effort_limit = wp.array(hand.effort, dtype=float, device=device)

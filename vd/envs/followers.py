@@ -12,7 +12,8 @@ class ActuatedActions:
 
     def __init__(self, state: TaskState):
         """Put the columns of the actions on the device."""
-        self._state, hand = state, state.hand
+        self._state = state
+        hand = state.hand
         self._full: wp.array | None = None
         if len(hand.actuated) == hand.num_joints:
             return

@@ -39,7 +39,8 @@ class SeenState:
 
     def __init__(self, state: TaskState):
         self._state = state
-        sim, n = state.sim, state.num_envs
+        sim = state.sim
+        n = state.num_envs
         random = state.cfg.randomisation
         longest = max(
             random.observation_latency_s[1] + random.observation_jitter_s,
@@ -61,7 +62,8 @@ class SeenState:
         if not self.is_late:
             return
         self.arrays = [wp.zeros_like(array) for array in present]
-        d, f = state.num_joints, state.num_fingers
+        d = state.num_joints
+        f = state.num_fingers
         slots = math.ceil(longest / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
         self._ring = state.zeros(n * slots, columns, saved="latency_ring")
@@ -81,10 +83,11 @@ class SeenState:
         self._state.launch(record_state_kernel, [*self._model, now], [self.head, self._ring])
 
     def begin(self, mask: wp.array) -> None:
-        """Draw the latencies of the environments of ``mask`` [N], whose past is their present state."""
+        """Draw the latencies of the environments of ``mask`` [N]; their past is their present state."""
         if not self.is_late:
             return
-        state, sim = self._state, self._state.sim
+        state = self._state
+        sim = self._state.sim
         now = self._now(sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd)
         state.launch(
             begin_latency_kernel,
@@ -104,7 +107,8 @@ class SeenState:
 
     def _now(self, joint_q: wp.array, joint_qd: wp.array, *bodies: wp.array) -> StateArrays:
         """A state, with the joints as their encoders report them."""
-        measured, servo = (joint_q, joint_qd), self._state.sim.servo
+        measured = (joint_q, joint_qd)
+        servo = self._state.sim.servo
         if servo is not None:
             servo.measure()  # once a control step otherwise
             measured = servo.measured_q, servo.measured_qd

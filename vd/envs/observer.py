@@ -34,8 +34,11 @@ class Observer:
 
     def __init__(self, state: TaskState, drawn: Randomiser, *, shapes: bool):
         """Allocate for what ``drawn`` has drawn; ``shapes`` also where they are not observed."""
-        self._state, self._drawn = state, drawn
-        cfg, n, device = state.cfg.observation, state.num_envs, state.device
+        self._state = state
+        self._drawn = drawn
+        cfg = state.cfg.observation
+        n = state.num_envs
+        device = state.device
         self.parts = observation_parts(cfg, state.num_fingers, state.num_joints)
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
@@ -55,7 +58,8 @@ class Observer:
             self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
         slices = teacher_observation_slices(state.num_fingers, state.num_joints)
         self._body_com = wp.clone(state.sim.model.body_com[: state.scene.bodies_per_world])
-        hand, materials = state.hand, PAPER.materials
+        hand = state.hand
+        materials = PAPER.materials
         self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]
         self._nominal = wp.vec4(
             materials.friction,
@@ -74,8 +78,9 @@ class Observer:
             ]
 
     def split(self, values: wp.array) -> tuple[wp.array, wp.array]:
-        """What the actor reads [N, O], and what the critic reads besides [N, A - O], of everything [N, A]."""
-        count, width = self.num_observations, values.shape[1]
+        """What the actor reads [N, O], and the critic besides [N, A - O], of everything [N, A]."""
+        count = self.num_observations
+        width = values.shape[1]
         if count == width:
             return values, wp.zeros((values.shape[0], 0), dtype=float, device=values.device)
         return values[:, :count], values[:, count:]
@@ -141,7 +146,8 @@ class Observer:
         """Write what was drawn."""
         if "dynamics" not in self.parts:
             return
-        state, drawn = self._state, self._drawn
+        state = self._state
+        drawn = self._drawn
         servo = self._no_servo if state.sim.servo is None else state.sim.servo.parameters
         frictions = [drawn.hand_friction, drawn.object_friction, drawn.table_friction]
         state.launch(

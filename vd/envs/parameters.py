@@ -63,7 +63,9 @@ class TaskParameters:
 
     def __init__(self, cfg: ReorientCfg, hand: HandModel, device: Any):
         """Put the configuration at full difficulty on ``device``."""
-        self.cfg, self._hand, self._device = cfg, hand, device
+        self.cfg = cfg
+        self._hand = hand
+        self._device = device
         self._staging: dict[str, np.ndarray] = {}
         for name, struct in _STRUCTS.items():
             array = wp.array([struct()], dtype=struct, device=device)
@@ -81,7 +83,7 @@ class TaskParameters:
         self.set_levels(Levels())
 
     def blended(self, nominal: Any, drawn: Any, dtype: Any) -> wp.array:
-        """Numbers that the level of physics takes from ``nominal`` to ``drawn``, of any like shapes.
+        """Numbers that the level of physics takes from ``nominal`` to ``drawn``, of like shapes.
 
         Returns:
             Their array on the device. It is written anew with every level.
@@ -102,12 +104,14 @@ class TaskParameters:
 
     def _set_task(self, levels: Levels) -> None:
         """Reward, success and goals."""
-        cfg, level = self.cfg, levels.goals
+        cfg = self.cfg
+        level = levels.goals
         loose = cfg.curriculum.loose
         # Thresholds shrink geometrically: each step of the level tightens by the same factor.
         slack = STILLNESS_START ** (1.0 - level)
         start = min(GOAL_START_RAD, cfg.goal.max_angle_rad)
-        reward, success = cfg.reward, cfg.success
+        reward = cfg.reward
+        success = cfg.success
 
         def threshold(tightest: float, loosest: float) -> float:
             return slack * blend(loosest, tightest, levels.stillness) if tightest > 0.0 else 0.0
@@ -152,7 +156,9 @@ class TaskParameters:
 
     def _set_physics(self, level: float) -> None:
         """Noise, disturbances and all ranges of what is drawn."""
-        cfg, random, materials = self.cfg, self.cfg.randomisation, PAPER.materials
+        cfg = self.cfg
+        random = self.cfg.randomisation
+        materials = PAPER.materials
         share = level if random.enabled else 0.0
         self._write(
             "action",

@@ -20,7 +20,8 @@ class PoseError:
     """
 
     def __init__(self, state: TaskState):
-        self._state, random = state, state.cfg.randomisation
+        self._state = state
+        random = state.cfg.randomisation
         self.is_wrong = random.enabled and max(random.object_pose_error) > 0.0
         if self.is_wrong:
             sizes = [random.object_pose_error]

@@ -13,19 +13,12 @@ import warp as wp
 
 from vd.command.device import warp_device
 from vd.envs.cfg import ReorientCfg
-from vd.envs.curriculum import (
-    Levels,
-    first_levels,
-    moving_levels,
-    next_levels,
-    progress_of,
-)
+from vd.envs.curriculum import Levels, moving_levels, next_levels
 from vd.envs.followers import ActuatedActions
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.reached_starts import ReachedStarts
 from vd.envs.saved_state import load_arrays, save_state, saved_levels
-from vd.envs.setup import rest_poses
 from vd.envs.starts import FreeStarts
 from vd.envs.task_state import build_task
 from vd.kernels.rng import init_rng_kernel
@@ -38,6 +31,8 @@ from vd.kernels.task.success import success_kernel
 from vd.sim.graphs import Graphs
 from vd.sim.simulator import CHECKED
 
+SETTLE_S = 1.5
+"""Time an object has to come to rest after a drop [s]; some slim ones still rock then."""
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one
 object in an unlucky start fails in the first step, again whenever the run is started anew, and is
@@ -46,7 +41,7 @@ no rate.
 
 
 class ReorientEnv:
-    """N environments, each with a hand (F fingers, D joints, A of them actuated) and an object to reorient.
+    """N environments of a hand (F fingers, D joints, A of them actuated) and an object to reorient.
 
     Objects are over a table, but rest in a hand whose palm looks up, and then there is none.
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
@@ -97,15 +92,16 @@ class ReorientEnv:
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
         self._launch = state.launch
-        self.hand, self.objects, self.scene, self.sim = (
-            state.hand,
-            state.objects,
-            state.scene,
-            state.sim,
-        )
-        self.fingers, self.parameters = state.fingers, state.parameters
-        self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
-        self.smoothed, self.goal_quat = state.smoothed, state.goal_quat
+        self.hand = state.hand
+        self.objects = state.objects
+        self.scene = state.scene
+        self.sim = state.sim
+        self.fingers = state.fingers
+        self.parameters = state.parameters
+        self.measured_q = state.measured_q
+        self.measured_qd = state.measured_qd
+        self.smoothed = state.smoothed
+        self.goal_quat = state.goal_quat
 
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
@@ -139,7 +135,7 @@ class ReorientEnv:
         self._moving = moving_levels(cfg)
         self.levels = Levels()
         """How hard the task is at present; all ones is the configured task."""
-        self.set_levels(first_levels(self._moving))
+        self.set_levels(Levels(**dict.fromkeys(self._moving, 0.0)))
         self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
         """Control steps of all environments since the begin of the run, with those of a
@@ -147,12 +143,13 @@ class ReorientEnv:
         """
         self._own_steps = 0
         if cfg.start.at_rest:
-            self._rest_poses = wp.array(rest_poses(self), dtype=wp.transform, device=self.device)
+            self._rest_poses = wp.array(self._dropped(), dtype=wp.transform, device=self.device)
         self.reset()
 
     def _allocate(self) -> None:
         """Arrays of what a step decides, and of its counts."""
-        n, zeros = self.num_envs, self.state.zeros
+        n = self.num_envs
+        zeros = self.state.zeros
         self.action = zeros(n, self.num_actions)
         self.reward = zeros(n)
         self.reward_terms = zeros(n, len(self.reward_term_names))
@@ -182,7 +179,8 @@ class ReorientEnv:
         self.ended = zeros(n, dtype=wp.int32)
         self._new_goal = zeros(n, dtype=wp.int32)
         self._env_mask = zeros(n + 1, dtype=wp.bool)
-        self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
+        self._given_start = zeros(n, dtype=wp.quat)
+        self._given_goal = zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         self._reset_q = wp.array(self.hand.start, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, self.hand.start)
@@ -192,6 +190,30 @@ class ReorientEnv:
         self._actuated = ActuatedActions(self.state)
         self.refused = zeros(n, dtype=wp.int32)
         """Actions that were not finite since that was told, shape [N]."""
+
+    def _dropped(self) -> np.ndarray:
+        """Where objects come to lie that are dropped a few times, shape [N, K, 7].
+
+        A drop that left the claw is replaced by one of the same environment that did not, or, if
+        all did, by the start. Each is a position [m] and a quaternion xyzw.
+        """
+        workspace = self.hand.workspace
+        dropped = []
+        for _ in range(self.cfg.start.poses):
+            self.reset()
+            for _ in range(round(SETTLE_S * self.cfg.sim.control_hz)):
+                wp.copy(self.sim.target, self.sim.joint_q)
+                self.sim.step()
+            self.check()
+            dropped.append(self.object_pose())
+        landed = np.stack(dropped, axis=1)
+        away_m = np.linalg.norm(landed[:, :, :3] - workspace.goal_m, axis=2)
+        inside = away_m < self.cfg.success.fall_of(workspace)
+        # Choose, for every slot, the slot itself or the first good one of the environment.
+        slot = np.where(inside, np.arange(len(dropped)), np.argmax(inside, axis=1)[:, None])
+        poses = np.take_along_axis(landed, slot[:, :, None], axis=1)
+        poses[~inside.any(axis=1)] = [*workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
+        return poses
 
     # Stepping
 
@@ -238,8 +260,10 @@ class ReorientEnv:
             envs: Their numbers, shape [E].
             goal_quat: Goal orientations, xyzw, shape [E, 4].
         """
-        mask, goals = np.zeros(self.num_envs, np.int32), self.goal_quat.numpy()
-        mask[envs], goals[envs] = 1, goal_quat
+        mask = np.zeros(self.num_envs, np.int32)
+        goals = self.goal_quat.numpy()
+        mask[envs] = 1
+        goals[envs] = goal_quat
         self.ended.zero_()
         self._new_goal.assign(mask)
         self._given_goal.assign(goals)
@@ -324,7 +348,8 @@ class ReorientEnv:
         self._graphs.replay(self.sim.step)
 
     def _apply_action(self) -> None:
-        p, sim = self.parameters, self.sim
+        p = self.parameters
+        sim = self.sim
         action = self._actuated.all_joints(self.action)
         if self.symmetry_frames is not None and self.acts_in_frame:
             action = self.symmetry_frames.world_action(action)
@@ -381,7 +406,8 @@ class ReorientEnv:
 
     def _judge(self) -> None:
         """Success and reward of the step, before resets."""
-        p, sim = self.parameters, self.sim
+        p = self.parameters
+        sim = self.sim
         self._launch(
             success_kernel,
             [
@@ -439,7 +465,8 @@ class ReorientEnv:
         self, reset: wp.array, *, use_start: bool = False, use_goal: bool = False
     ) -> None:
         """Reset the environments of ``reset`` [N], give a goal to those of ``_new_goal`` too."""
-        sim, p = self.sim, self.parameters
+        sim = self.sim
+        p = self.parameters
         self._launch(
             reset_kernel,
             [
@@ -488,7 +515,7 @@ class ReorientEnv:
     # Reading
 
     def has_table(self) -> np.ndarray:
-        """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
+        """Whether each table was there in the last step, bool, shape [N] (host copy)."""
         if self.hand.palm_up:
             return np.zeros(self.num_envs, bool)
         return np.asarray(self.step_count.numpy() <= self.parameters.table_steps.numpy())
@@ -523,7 +550,7 @@ class ReorientEnv:
         self.sim.check(FAILURES_AT_FIRST + expected if rate > 0.0 else 0.0)
 
     def failed_steps(self) -> int:
-        """Steps of environments that failed and were put back (:attr:`ReorientCfg.failures_per_million`)."""
+        """Steps of environments that failed and were put back (``failures_per_million``)."""
         return int(self.sim.failures.numpy().sum())
 
     # Curriculum and checkpoints
@@ -552,7 +579,9 @@ class ReorientEnv:
     @property
     def progress(self) -> float:
         """How far all levels that move have come together, in [0, 1]; 1: the configured task."""
-        return progress_of(self.levels, self._moving)
+        if not self._moving:
+            return 1.0
+        return sum(getattr(self.levels, name) for name in self._moving) / len(self._moving)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly, see :func:`vd.envs.saved_state.save_state`."""

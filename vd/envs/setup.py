@@ -1,19 +1,14 @@
 """What is chosen once, when environments are built.
 
-Sizes of objects, tables that leave, starts at rest.
+Sizes of objects, tables that leave.
 """
 
-from typing import Any
-
 import numpy as np
-import warp as wp
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 
 ALWAYS = 2**31 - 1
 """Last step of a table that stays."""
-SETTLE_S = 1.5
-"""Time an object has to come to rest after a drop [s]; some slim ones still rock then."""
 
 
 def object_scales(random: RandomisationCfg) -> list[float]:
@@ -31,7 +26,8 @@ def table_steps(cfg: ReorientCfg, air: float) -> np.ndarray:
     Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it
     to the policy.
     """
-    table, n = cfg.table, cfg.num_envs
+    table = cfg.table
+    n = cfg.num_envs
     draw = np.random.default_rng(cfg.seed)
     away = draw.permutation(n) < round(air * table.away_share * n)
     steps = np.maximum(1, np.round(draw.uniform(*table.away_s, size=n) * cfg.sim.control_hz))
@@ -46,30 +42,3 @@ def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
     """
     n = cfg.num_envs
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
-
-
-def rest_poses(env: Any) -> np.ndarray:
-    """Drop every object of a ReorientEnv a few times.
-
-    Where they came to lie, float, shape [N, K, 7].
-
-    A drop that left the claw is replaced by one of the same environment that did not, or, if all
-    did, by the start. Each is a position [m] and a quaternion xyzw.
-    """
-    workspace, dropped = env.hand.workspace, []
-    for _ in range(env.cfg.start.poses):
-        env.reset()
-        for _ in range(round(SETTLE_S * env.cfg.sim.control_hz)):
-            wp.copy(env.sim.target, env.sim.joint_q)
-            env.sim.step()
-        env.check()
-        dropped.append(env.object_pose())
-    landed = np.stack(dropped, axis=1)
-    inside = np.linalg.norm(landed[:, :, :3] - workspace.goal_m, axis=2) < env.cfg.success.fall_of(
-        workspace
-    )
-    # Choose, for every slot, the slot itself or the first good one of the world.
-    slot = np.where(inside, np.arange(len(dropped)), np.argmax(inside, axis=1)[:, None])
-    poses = np.take_along_axis(landed, slot[:, :, None], axis=1)
-    poses[~inside.any(axis=1)] = [*workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
-    return poses

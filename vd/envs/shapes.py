@@ -40,14 +40,15 @@ class ShapeObserver:
     ):
         device = points.device
         self._shapes = [points, world_object, world_scale]
-        self._tips, fingers = [tip_body, tip_offset], len(tip_body)
+        self._tips = [tip_body, tip_offset]
+        fingers = len(tip_body)
         self._directions = wp.array(extent_directions(fingers), dtype=wp.vec3, device=device)
         self._slices = shape_observation_slices(fingers)
         self._surface_dim = len(world_object), fingers
         self._extent_dim = len(world_object), ORIENTATIONS, len(self._directions)
 
     def measure_clearance(self, joint_q: wp.array, column: int, out: wp.array) -> None:
-        """Write the heights of the objects' lowest points above the table [m] into ``out``, shape [N].
+        """Write heights of the objects' lowest points above the table [m] into ``out``, shape [N].
 
         Args:
             joint_q: Coordinates, shape [N, *].

@@ -26,7 +26,8 @@ class FreeStarts:
 
     def __init__(self, state: TaskState, reset_q: np.ndarray):
         self._state = state
-        device, shapes = state.device, state.hand.shapes
+        device = state.device
+        shapes = state.hand.shapes
         links = compose(state.hand.mount, state.hand.forward_kinematics(reset_q))
         poses = np.array([compose(links[shape.link], shape.frame) for shape in shapes])
         half, radius = zip(*map(rounded_box, shapes), strict=True)
@@ -44,7 +45,8 @@ class FreeStarts:
 
         Device work only.
         """
-        state, places = self._state, self._places
+        state = self._state
+        places = self._places
         state.launch(
             start_depth_kernel,
             [

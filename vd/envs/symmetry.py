@@ -35,8 +35,10 @@ class ChosenFrames:
             ValueError: The hand has no such frames, see
                 :func:`vd.envs.symmetry_frames.symmetry_frames`.
         """
-        self._state, self._out = state, out
-        device, envs = state.device, state.num_envs
+        self._state = state
+        self._out = out
+        device = state.device
+        envs = state.num_envs
         seen = state.cfg.observation
         tables = self.tables = symmetry_frames(state.hand, seen, seen.view)
         chosen_from = seen.num_frames(state.num_fingers)

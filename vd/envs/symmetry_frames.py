@@ -74,7 +74,8 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
     """
     if len(hand.actuated) < hand.num_joints:
         raise ValueError(f"joints of {hand.name} follow others; set observation.view to world")
-    fingers, each = hand.num_fingers, hand.joints_per_finger
+    fingers = hand.num_fingers
+    each = hand.joints_per_finger
     tips = _tips(hand, np.zeros(each))
     turns = [_turn(step, fingers) for step in range(fingers)]
     if view == "mirrored":
@@ -120,7 +121,8 @@ def _mirror(hand: HandModel, tips: np.ndarray) -> np.ndarray:
         source = _finger_source(tips, mirror)
     except ValueError as error:
         raise ValueError(refusal) from error
-    bent, opposite = _tips(hand, BENT)[source], _tips(hand, MIRROR_SIGNS * BENT)
+    bent = _tips(hand, BENT)[source]
+    opposite = _tips(hand, MIRROR_SIGNS * BENT)
     apart = np.linalg.norm(bent[:, :3] @ mirror.T - opposite[:, :3], axis=1)
     axes = Rotation.from_quat(bent[:, 3:]).as_matrix()
     twisted = np.abs(
@@ -164,7 +166,8 @@ def _observation_offset(
     """
     parts = observation_parts(observation, hand.num_fingers, hand.num_joints)
     offset = np.zeros(max(columns.stop for columns in parts.values()))
-    lower, upper = np.asarray(hand.lower), np.asarray(hand.upper)
+    lower = np.asarray(hand.lower)
+    upper = np.asarray(hand.upper)
     turned_round = _joint_signs(turn, hand.num_fingers, hand.joints_per_finger) < 0.0
     columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)["joint_position"]
     for part in {"state", "present"} & parts.keys():
@@ -185,7 +188,8 @@ def _observation_map(
         each: Joints of each finger.
         turn: Turn or reflection [3, 3] of the world that makes the frame.
     """
-    count, fingers = len(tips), _finger_source(tips, turn)
+    count = len(tips)
+    fingers = _finger_source(tips, turn)
     parts = observation_parts(observation, count, each * count)
     quaternion = _orientation_map(turn)
     axial = np.linalg.det(turn) * turn  # rotations look the other way in a mirror

@@ -105,7 +105,8 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
     Raises:
         ValueError: For a configuration that cannot work, naming field and remedy.
     """
-    hand, objects = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer), load_set(list(cfg.objects))
+    hand = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer)
+    objects = load_set(list(cfg.objects))
     if hand.palm_up and (cfg.table.away_share > 0.0 or cfg.table.lift_share > 0.0):
         raise ValueError(
             f"{hand.name} looks up, so there is no table: leave table.away_share and "

@@ -26,13 +26,16 @@ class OwnTerms:
     """
 
     def __init__(self, cfg: ReorientCfg):
-        self._coefficients, self._scale = cfg.reward.terms, cfg.reward.scale
-        seen, told = cfg.observation.terms, cfg.observation.critic_terms
+        self._coefficients = cfg.reward.terms
+        self._scale = cfg.reward.scale
+        seen = cfg.observation.terms
+        told = cfg.observation.critic_terms
         if twice := sorted(seen.keys() & told.keys()):
             raise ValueError(
                 f"observation.critic_terms has {twice[0]}, which the critic is shown already"
             )
-        self._sizes, self._told = cfg.observation.own, told
+        self._sizes = cfg.observation.own
+        self._told = told
         if wrong := [name for name, size in self._sizes.items() if size < 1]:
             raise ValueError(f"observation.terms: {wrong[0]} has to give 1 value or more")
         self._functions = {
@@ -45,7 +48,8 @@ class OwnTerms:
     @torch.no_grad()
     def pay(self, env: Any) -> None:
         """Add to the reward of a step what own terms give for the state before resets."""
-        reward, terms = wp.to_torch(env.reward), wp.to_torch(env.reward_terms)
+        reward = wp.to_torch(env.reward)
+        terms = wp.to_torch(env.reward_terms)
         failed = wp.to_torch(env.sim.failed) > 0
         for column, (name, coefficient) in enumerate(self._coefficients.items(), len(REWARD_TERMS)):
             paid = (coefficient * self._value(env, name, 1)[:, 0]).masked_fill(failed, 0.0)
@@ -54,14 +58,12 @@ class OwnTerms:
 
     @torch.no_grad()
     def observe(self, env: Any) -> None:
-        """Write own values of the present state into the observation, as they are in every frame."""
+        """Write own values of the present state into the observation, alike in every frame."""
         observer = env.observer
         first = {part: columns.start for part, columns in observer.parts.items()}
         for name, size in self._sizes.items():
-            value, part = (
-                self._value(env, name, size),
-                "critic_terms" if name in self._told else "terms",
-            )
+            value = self._value(env, name, size)
+            part = "critic_terms" if name in self._told else "terms"
             for array in (observer.world_values, observer.all_values):
                 wp.to_torch(array)[:, first[part] : first[part] + size] = value
             first[part] += size

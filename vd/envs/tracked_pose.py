@@ -39,7 +39,8 @@ class TrackedPose:
         params.jump = wp.vec2(*cfg.jump)
         params.noise = wp.vec2(*cfg.noise)
         self._params = wp.array([params], dtype=TrackedPoseParams, device=state.device)
-        n, zeros = state.num_envs, state.zeros
+        n = state.num_envs
+        zeros = state.zeros
         self._rate = zeros(n, saved="tracked_rate")
         self._delay = zeros(n, saved="tracked_delay")
         self._clock = zeros(n, saved="tracked_clock")

@@ -6,7 +6,7 @@ A trained actor, zero or random actions. They need torch only, no simulator and 
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -30,18 +30,8 @@ EmpiricalNormalization).
 """
 
 
-class Policy(Protocol):
-    """Anything that acts on observations."""
-
-    num_actions: int
-
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Actions [N, D] in about [-1, 1] for observations [N, O], on the same device."""
-        ...
-
-
 class MeanAction(nn.Module):
-    """Normalisation of observations, if it belongs to the actor, its perceptron, and the mean it gives."""
+    """An actor's perceptron, its normalisation of observations if it has one, and its mean."""
 
     def __init__(self, spec: PolicySpec, weights: dict[str, torch.Tensor]) -> None:
         super().__init__()
@@ -133,7 +123,8 @@ class FunctionPolicy:
     """A function of a user, from observations [N, O] to actions [N, A], tensors of one device."""
 
     def __init__(self, function: Callable[[torch.Tensor], torch.Tensor], num_actions: int) -> None:
-        self._function, self.num_actions = function, num_actions
+        self._function = function
+        self.num_actions = num_actions
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions [N, A].
@@ -154,7 +145,9 @@ class FunctionPolicy:
 def read_state(
     path: str | Path, device: str = "cpu", *, remedy: str, wanted: str = CHECKPOINT_FORMAT
 ) -> dict[str, Any]:
-    """What torch saved in a file of the format ``wanted``, its weights whole; executes nothing in it.
+    """What torch saved in a file of the format ``wanted``, its weights whole.
+
+    Executes nothing in it.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -236,7 +229,7 @@ def stage_of(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:
-    """The multilayer perceptron with the layer names rsl-rl gives it, ELU between them as in the paper."""
+    """The multilayer perceptron with rsl-rl's names of layers, ELU between them as in the paper."""
     outputs = spec.num_actions * (2 if spec.distribution == "state-dependent" else 1)
     layers: list[nn.Module] = []
     width = spec.num_observations

@@ -1,4 +1,4 @@
-"""Agents by name or file, and the task they act in: shared by all commands that let a policy act."""
+"""Agents by name or file, and the task they act in, for all commands that let one act."""
 
 import re
 from collections.abc import Iterable
@@ -133,7 +133,7 @@ def find_policy(name: str | Path) -> Path:
 
 
 def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None = None) -> None:
-    """Refuse agents, object sets and a hand that are not there, before anything slow is imported."""
+    """Refuse agents, object sets and a hand that are not there, before slow imports."""
     from vd.assets_usd.hands import check_hand_name
     from vd.assets_usd.objects.sets import check_sets
 

@@ -1,4 +1,4 @@
-"""Teachers and tracking policies that ``vd-train export`` wrote as ONNX, by onnxruntime, without torch.
+"""Teachers and tracking policies that were exported as ONNX, by onnxruntime, without torch.
 
 Such a file has the contract of the policy it was made of among its metadata, and its seal.
 """

@@ -15,7 +15,7 @@ CANDIDATES = 24
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """Stop at the first step at which the predicted distance and the norm of the action are below bounds.
+    """Stop at the first step whose predicted distance and norm of the action are below bounds.
 
     Both are of the same moment: the prediction from what is seen, and the smoothed action that led
     there. Before the first action there is none, and nothing to stop.
@@ -27,7 +27,7 @@ class StoppingRule:
     """Bound of the norm of the smoothed action, a-bar."""
 
     def stops(self, distance: np.ndarray, action_norm: np.ndarray) -> np.ndarray:
-        """Where to stop, for predicted distances [rad] and norms of the smoothed action of one shape."""
+        """Where to stop, for predicted distances [rad] and norms of smoothed actions of one shape."""
         return (distance < self.distance_rad) & (action_norm < self.action_norm)
 
 

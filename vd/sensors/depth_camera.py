@@ -76,18 +76,16 @@ class DepthCamera:
         """
         self.cfg = cfg = cfg or DepthCameraCfg()
         cfg.validate()
-        self.camera, self.surfaces, self.body_q = camera, surfaces, body_q
+        self.camera = camera
+        self.surfaces = surfaces
+        self.body_q = body_q
         self.device = device = str(body_q.device)
         self.num_envs = n = surfaces.num_envs
         self._camera_body = camera_body
-        self.height, self.width = camera.height, camera.width
+        self.height = camera.height
+        self.width = camera.width
         self._cloud = cloud = DepthCloud(
-            camera.height,
-            camera.width,
-            n,
-            points=cfg.points,
-            crop_m=cfg.crop_m,
-            device=device,
+            camera.height, camera.width, n, points=cfg.points, crop_m=cfg.crop_m, device=device
         )
         self.points = cloud.points
         """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape
@@ -96,7 +94,8 @@ class DepthCamera:
         """Points of each cloud, shape [N]."""
         self.available = cloud.available
         """Pixels within the crop, of which the points were chosen, shape [N]."""
-        shapes, image = surfaces.num_shapes, (camera.height, camera.width)
+        shapes = surfaces.num_shapes
+        image = (camera.height, camera.width)
         self._table = _table_box()
         self._lanes = 1 if device == "cpu" else WARP_LANES
         generator = np.random.default_rng(seed)
@@ -197,7 +196,8 @@ class DepthCamera:
 
         Nothing reaches the host.
         """
-        n, surfaces = self.num_envs, self.surfaces
+        n = self.num_envs
+        surfaces = self.surfaces
         body_q = self._late_poses()
         launch(
             place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q]
@@ -291,9 +291,13 @@ def _believed(camera: CameraModel, cfg: DepthCameraCfg, extrinsics: wp.array) ->
 def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:
     params = DepthSensorParams()
     params.depth_disparity = FOCAL_PX * BASELINE_M
-    params.disparity_std, params.disparity_step = cfg.disparity_std_px, cfg.disparity_step_px
+    params.disparity_std = cfg.disparity_std_px
+    params.disparity_step = cfg.disparity_step_px
     params.shadow = camera.fx * BASELINE_M if cfg.shadow else 0.0
     params.edge_jump = cfg.edge_jump_m if cfg.uses_edges else 0.0
-    params.edge_dropout, params.flying, params.dropout = cfg.edge_dropout, cfg.flying, cfg.dropout
-    params.min_range, params.max_range = cfg.min_range_m, camera.far
+    params.edge_dropout = cfg.edge_dropout
+    params.flying = cfg.flying
+    params.dropout = cfg.dropout
+    params.min_range = cfg.min_range_m
+    params.max_range = camera.far
     return params

@@ -23,13 +23,17 @@ from vd.paper import PAPER
 def make_views(camera: CameraModel, count: int, device: str) -> wp.array:
     """The intrinsics of so many equal cameras."""
     view = View()
-    view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    view.near, view.far = camera.near, camera.far
+    view.fx = camera.fx
+    view.fy = camera.fy
+    view.cx = camera.cx
+    view.cy = camera.cy
+    view.near = camera.near
+    view.far = camera.far
     return wp.array([view] * count, dtype=View, device=device)
 
 
 class DepthCloud:
-    """Crops N depth images by height over the table and chooses K points of each, in the base's frame."""
+    """Crops N depth images by height over the table, and chooses K points of each in the base."""
 
     def __init__(
         self,
@@ -41,7 +45,7 @@ class DepthCloud:
         crop_m: tuple[float, float] = PAPER.camera.crop_m,
         device: str = "cpu",
     ):
-        """Allocate N clouds of at most K ``points`` with heights in the world frame within ``crop_m`` [m]."""
+        """Allocate N clouds of at most K ``points``, of world heights within ``crop_m`` [m]."""
         self.crop_m = crop_m
         self._tile_rows = math.ceil(height / int(TILE_ROWS))
         self._tile_columns = math.ceil(width / int(TILE_COLUMNS))
@@ -141,15 +145,13 @@ class CameraCloud:
         self._rng = wp.empty(1, dtype=wp.uint32, device=device)
         launch(init_rng_kernel, 1, [seed], [self._rng])
 
-    def make(self, depth: np.ndarray) -> tuple[wp.array, wp.array]:
-        """Make the cloud of an image.
+    def seen(self, depth: np.ndarray) -> wp.array:
+        """The points of an image as :class:`vd.policy.senses.Senses` has them [1, K].
+
+        The next call changes them.
 
         Args:
             depth: Depth along the optical axis [m], 0 for none, shape [H, W].
-
-        Returns:
-            Points in the frame of the hand's base [m], NaN beyond the count, shape [1, K]; the
-            count, [1].
 
         Raises:
             ValueError: The image has another size than the camera.
@@ -162,16 +164,7 @@ class CameraCloud:
         self.depth.assign(np.asarray(depth, dtype=np.float32)[None])
         self.cloud.make(self.depth, self._views, self._camera_q, self._extrinsics, self._rng)
         launch(next_frame_kernel, 1, [], [self._rng])
-        return self.cloud.points, self.cloud.count
-
-    def seen(self, depth: np.ndarray) -> wp.array:
-        """The points of an image as :class:`vd.policy.senses.Senses` has them [1, K].
-
-        The next call changes them.
-
-        Argument and errors are those of :meth:`make`.
-        """
-        points, count = self.make(depth)
-        if not count.numpy()[0]:  # the false point of an empty cloud counts for nothing
+        points = self.cloud.points
+        if not self.cloud.count.numpy()[0]:  # the false point of an empty cloud counts for nothing
             points.fill_(math.nan)
         return points

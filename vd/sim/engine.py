@@ -90,7 +90,8 @@ class CSolver(WarpSolver):
             )
         self._model_changed = True
         super().__init__(model, **settings)
-        shapes, first = self.mjc_geom_to_newton_shape.numpy(), 0
+        shapes = self.mjc_geom_to_newton_shape.numpy()
+        first = 0
         self._runs = []
         for builder, count in worlds:
             one = newton.ModelBuilder()
@@ -132,7 +133,9 @@ class _Run:
     """
 
     def __init__(self, exported: mujoco.MjModel, rows: slice, geoms: np.ndarray):
-        self._exported, self._rows, self._geoms = exported, rows, geoms
+        self._exported = exported
+        self._rows = rows
+        self._geoms = geoms
         self._worlds = rows.stop - rows.start
         exported.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO  # dense: faster on a CPU
         # A state that is not finite is for the guard to see; bounding volumes do not follow centres
@@ -145,7 +148,8 @@ class _Run:
 
     def step(self, model: Any, data: Any, *, model_changed: bool) -> None:
         """One step from MuJoCo Warp's arrays into them."""
-        batch, rows = self._batch, self._rows
+        batch = self._batch
+        rows = self._rows
         self._copy_model(model, DRIVES)
         if model_changed:
             self._copy_model(
@@ -170,7 +174,8 @@ class _Run:
         All others are as they were exported.
         """
         for name in names:
-            ours, exported = getattr(model, name), getattr(self._exported, name)
+            ours = getattr(model, name)
+            exported = getattr(self._exported, name)
             if not exported.size or not isinstance(ours, wp.array) or ours.dtype is wp.int32:
                 continue
             values = ours.numpy()

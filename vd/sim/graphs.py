@@ -13,7 +13,8 @@ class Graphs:
     """
 
     def __init__(self, device: str, *, captured: bool = True):
-        self._device, self._captured = device, captured
+        self._device = device
+        self._captured = captured
         self._known: dict[str, Any] = {}
 
     def replay(self, launch: Callable[[], None]) -> None:

@@ -70,6 +70,7 @@ class JointServo:
 
         Args:
             solver: The solver, whose model this class writes drives and friction of the hand into.
+                The hand's joints are the first of each world, with a position drive each.
             control: The control of the simulation; its joint targets become the drives' references
                 and its joint forces the torques besides the drives'.
             joint_q: Positions, hand joints first, shape [N, *]; read at every reset.
@@ -80,20 +81,15 @@ class JointServo:
             seed: Seed of the random delays and losses of commands.
 
         Raises:
-            ValueError: Rows of the wrong shape or with values that cannot be simulated.
+            ValueError: Rows with values that cannot be simulated.
         """
         self.num_envs = n = joint_q.shape[0]
-        self.num_joints = d = np.shape(rows)[-2] if np.ndim(rows) >= 2 else 0
+        self.num_joints = d = rows.shape[-2]
         self.dt = physics_dt
-        self._solver, self._control, self._joint_q = solver, control, joint_q
+        self._solver = solver
+        self._control = control
+        self._joint_q = joint_q
         self.device = solver.model.device
-        expected = np.arange(d)
-        dofs = solver.mjc_dof_to_newton_dof.numpy()[0, :d]
-        drives = solver.mjc_actuator_to_newton_idx.numpy()[:d]
-        if not (np.array_equal(dofs, expected) and np.array_equal(drives, expected)):
-            raise ValueError(
-                "the hand's joints must be the first of each world, one position drive each"
-            )
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -156,13 +152,9 @@ class JointServo:
         Raises:
             ValueError: Names the joint and the parameter that cannot be simulated.
         """
-        n, d = self.num_envs, self.num_joints
+        n = self.num_envs
+        d = self.num_joints
         rows = np.asarray(rows, dtype=np.float32)
-        if rows.shape not in ((d, PARAMETER_COLUMNS), (n, d, PARAMETER_COLUMNS)) or d == 0:
-            raise ValueError(
-                f"servo rows have shape {rows.shape}; give (D, {PARAMETER_COLUMNS}) or ({n}, D, "
-                f"{PARAMETER_COLUMNS}) with D hand joints"
-            )
         for column, (effect, parameter) in PARAMETERS.items():
             values = rows[..., column]
             limit = parameter.upper if column in DELAYS else np.inf

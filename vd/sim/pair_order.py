@@ -29,8 +29,10 @@ class PairOrder:
             return wp.zeros(count, dtype=dtype, device=data.geom_xpos.device)
 
         # Sorting needs as much room again.
-        self._key, self._order = room(2 * self._most, wp.int32), room(2 * self._most, wp.int32)
-        self._pair, self._pair_id = room(self._most, wp.vec2i), room(self._most, wp.vec2i)
+        self._key = room(2 * self._most, wp.int32)
+        self._order = room(2 * self._most, wp.int32)
+        self._pair = room(self._most, wp.vec2i)
+        self._pair_id = room(self._most, wp.vec2i)
         self._world = room(self._most, wp.int32)
 
     def sort(self, model: Any, data: Data, found: Any) -> None:

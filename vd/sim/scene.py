@@ -69,7 +69,7 @@ class Scene:
     link_body: np.ndarray
     """Body index within a world of every hand link, base first, shape [D + 1]."""
     object_body: int
-    """Body index within a world of the object."""
+    """Body index within a world of the object; -1 where there is none."""
     shape_kind: np.ndarray
     """SHAPE_* of every shape, shape [S]."""
     worlds: list[tuple[newton.ModelBuilder, int]]
@@ -220,7 +220,8 @@ def add_table(
 
 def show_table(builder: newton.ModelBuilder, cfg: SimCfg, body: int = -1) -> None:
     """Add what is seen of the table, a box, to the world or to a body at the world's origin."""
-    size, top = PAPER.scene.table_size_m, PAPER.scene.table_top_m
+    size = PAPER.scene.table_size_m
+    top = PAPER.scene.table_top_m
     builder.add_shape_box(
         body=body,
         xform=wp.transform(wp.vec3(0.0, 0.0, top - 0.5 * size[2]), wp.quat_identity()),
@@ -302,7 +303,7 @@ def build_scene(
 
     Args:
         hand: The hand, read from USD (path and fingertip kind are taken from it).
-        objects: Objects, spread over the worlds.
+        objects: Objects, spread over the worlds; none of a hand alone.
         num_envs: N.
         cfg: Physics settings.
         device: Warp device.
@@ -310,21 +311,21 @@ def build_scene(
         visuals: Include visual shapes.
 
     Raises:
-        ValueError: If there is no object, or fewer worlds than objects.
+        ValueError: There are fewer worlds than objects.
     """
     cfg.validate()
-    if not objects:
-        raise ValueError("no objects to simulate; name a set with --objects (vd-assets makes them)")
     if num_envs < len(objects):
         raise ValueError(
             f"num_envs = {num_envs} is fewer than the {len(objects)} objects; "
             "raise num_envs or name fewer objects"
         )
     hand_builder = build_hand(hand, cfg, visuals=visuals)
-    world_object = assign_objects(num_envs, len(objects))
+    items: list[ObjectModel | None] = list(objects) or [None]
+    world_object = assign_objects(num_envs, len(items))
     world_scale = np.ones(num_envs)
-    scene, worlds = new_builder(), []
-    for index, item in enumerate(objects):
+    scene = new_builder()
+    worlds = []
+    for index, item in enumerate(items):
         count = int(np.count_nonzero(world_object == index))
         scale_index = assign_objects(count, len(scales))
         world_scale[world_object == index] = np.asarray(scales)[scale_index]
@@ -334,19 +335,18 @@ def build_scene(
                 continue
             world = new_builder()
             world.add_builder(hand_builder)
-            if (
-                not hand.palm_up
-            ):  # what rests in a hand needs no table, and what falls from it is lost
+            # What rests in a hand needs no table, and what falls from it is lost.
+            if not hand.palm_up:
                 add_table(world, cfg, visible=visuals, item=item)
-            add_object(
-                world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals
-            )
+            if item is not None:
+                drop_m = hand.workspace.drop_m
+                add_object(world, item, cfg, at=drop_m, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
     model = scene.finalize(device=device)
     bodies = model.body_count // num_envs
     names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
-    object_body = names.index(OBJECT_LABEL)
+    object_body = names.index(OBJECT_LABEL) if objects else -1
     return Scene(
         model=model,
         hand=hand,

@@ -70,12 +70,14 @@ class Simulator:
             servo_seed: Seed of the random delays and losses of commands.
         """
         cfg.validate()
-        self.scene, self.cfg = scene, cfg
+        self.scene = scene
+        self.cfg = cfg
         self.model = scene.model
         self.device = self.model.device
         self.num_envs = n = scene.num_envs
         self.solver = make_solver(self.model, cfg, scene.worlds)
-        self.state, self._next = self.model.state(), self.model.state()
+        self.state = self.model.state()
+        self._next = self.model.state()
         self.control = self.model.control()
         if self.device.is_cuda:  # a processor has no warps that would wait
             sort_pairs(self.solver.mjw_model, self.solver.mjw_data)
@@ -145,7 +147,7 @@ class Simulator:
         wp.copy(self._next_body_force, self.body_force)
         if self.servo is not None:
             self.servo.send(self.target)
-        self._physics_steps()
+        self.physics_steps()
         if self.servo is not None:
             self.servo.measure()
         self._table_contact()
@@ -157,7 +159,7 @@ class Simulator:
         )
 
     def put_back(self, step_count: wp.array, last_step: int) -> None:
-        """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
+        """Put worlds of which this step failed back to its begin (:func:`put_back_kernel`)."""
         launch(
             put_back_kernel,
             self.num_envs,
@@ -165,11 +167,8 @@ class Simulator:
             [self.joint_q, self.joint_qd, step_count],
         )
 
-    def _physics_steps(self) -> None:
-        """The physics steps of one control step, with what surrounds them.
-
-        States end where they began.
-        """
+    def physics_steps(self) -> None:
+        """The physics steps of one control step alone; states end where they began."""
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
         there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
@@ -225,7 +224,7 @@ class Simulator:
         self.place_tables(counts, wp.full(n, int(present), dtype=wp.int32, device=self.device))
 
     def place_tables(self, step_count: wp.array, last_step: wp.array) -> None:
-        """Put each world's table where it belongs until its last step, then out of reach of everything.
+        """Put each world's table where it belongs until its last step, then out of reach.
 
         The solver computes where fixed shapes are once, when it is built, so this is written into
         its data, where a captured step finds it. Device work only.
@@ -246,7 +245,7 @@ class Simulator:
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
     def check(self, tolerated: float = 0.0) -> None:
-        """Raise if a step lost contacts, or if more steps failed than are tolerated (two host reads).
+        """Raise if a step lost contacts, or more steps failed than are tolerated (two host reads).
 
         Args:
             tolerated: Control steps of worlds that may have left the finite numbers or been too
