@@ -9,7 +9,7 @@ import numpy as np
 
 from vd.command.page import write_html
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, HOLD_S
-from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row, Summary
+from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
 
 if TYPE_CHECKING:
@@ -158,41 +158,25 @@ def write_page(
 
 
 def terminal_text(result: Result) -> str:
-    """Tables, warnings and settings, for a terminal.
-
-    Of one policy without a suite by object too.
-    """
+    """The main tables, warnings and settings, for a terminal; the page has all others."""
     if not result.rows:
         return ""
     result = shortened(result)
-    parts = []
-    for header, rows in (_success_table(result.rows), _beside_table(result.rows)):
-        lines = [header]
-        for row in rows:
-            # Only the first figure has its interval here: a line has to fit.
-            figures = [cell.split(" (")[0] for cell in row[WORDS + 1 :]]
-            lines.append([*row[: WORDS + 1], *figures])
-        parts.append(aligned(lines, words=WORDS))
+    header, rows = _success_table(result.rows)
+    lines = [header]
+    for row in rows:
+        # Only the first figure has its interval here: a line has to fit.
+        figures = [cell.split(" (")[0] for cell in row[WORDS + 1 :]]
+        lines.append([*row[: WORDS + 1], *figures])
+    parts = [aligned(lines, words=WORDS)]
     for header, rows in (_air_table(result.rows), _consecutive_table(result.rows)):
         if rows:
             parts.append(aligned([header, *rows], words=2))
-    suite = any(row.condition for row in result.rows)
-    if len(result.policies) == 1 and not suite:
-        parts += _object_parts(result)
     parts += map("  ".join, _differences(result))
     parts += [f"warning {name}: {warning}" for name, warning in result.warnings.items()]
-    if not suite:
+    if not any(row.condition for row in result.rows):
         parts.append(settings_text([row.protocol for row in result.rows]))
     return "\n\n".join(parts)
-
-
-def _object_parts(result: Result) -> list[str]:
-    parts = []
-    for row in result.rows:
-        if row.headline:
-            header, rows = _object_table(row)
-            parts.append(f"{_heading(row)}\n{aligned([header, *rows], words=1)}")
-    return parts
 
 
 def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
@@ -217,8 +201,8 @@ def ecdf_figure(result: Result) -> "Figure":
     headlines = result.headlines()
     columns = min(PANELS, len(headlines))
     rows = -(-len(headlines) // columns)
-    width, height = PANEL_INCH
-    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
+    size = np.multiply((columns, rows), PANEL_INCH)
+    figure = Figure(figsize=size, layout="constrained")
     angle = np.linspace(0.0, np.pi, 200)
     by_chance = (angle - np.sin(angle)) / np.pi  # of orientations uniform on SO(3)
     colour = dict(zip(result.policies, COLOURS * len(result.policies), strict=False))
@@ -287,15 +271,16 @@ def _names(row: Row) -> tuple[str, str, str]:
 
 def _object_table(row: Row) -> Table:
     """All objects of a row, and each."""
-    return _OBJECT_HEADER, [_object_cells(summary) for summary in (row.overall, *row.per_object)]
-
-
-def _object_cells(summary: Summary) -> list[str]:
-    cells = [summary.name]
-    cells += map(percent, summary.outcomes.values())
-    cells.append(percent(summary.symmetric))
-    cells.append(number(summary.median_error_rad))
-    return cells
+    lines = [
+        (
+            summary.name,
+            *map(percent, summary.outcomes.values()),
+            percent(summary.symmetric),
+            number(summary.median_error_rad),
+        )
+        for summary in (row.overall, *row.per_object)
+    ]
+    return _OBJECT_HEADER, lines
 
 
 def _air_table(rows: Sequence[Row]) -> Table:

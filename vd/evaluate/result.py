@@ -353,6 +353,12 @@ def judge(
         episodes = trace.episodes(rule, by)
         by_symmetry = "error" if by == "exact" else by
         alike = _stopped_within(trace, rule, by_symmetry, trace.error, tolerance)
+        per_object = []
+        for k, name in enumerate(names):
+            chosen = slice(k * protocol.episodes, (k + 1) * protocol.episodes)
+            per_object.append(
+                summarise(name, episodes[chosen], alike[k : k + 1], protocol, "episode")
+            )
         rows.append(
             Row(
                 policy=agent.policy,
@@ -365,7 +371,7 @@ def judge(
                 protocol=protocol,
                 object_names=names,
                 overall=summarise("all", episodes, alike, protocol, unit),
-                per_object=_per_object(names, episodes, alike, protocol),
+                per_object=tuple(per_object),
                 held=None if in_a_row else _held(trace, way, tolerance, unit),
                 precise=None if in_a_row else _precise(trace, agent, stopped_by, unit),
                 prediction=_prediction(trace) if by == "predicted" and not in_a_row else None,
@@ -376,17 +382,6 @@ def judge(
             )
         )
     return rows
-
-
-def _per_object(
-    names: Sequence[str], episodes: tuple[Episode, ...], alike: np.ndarray, protocol: Protocol
-) -> tuple[Summary, ...]:
-    count = protocol.episodes
-    summaries = []
-    for k, name in enumerate(names):
-        of_object = episodes[k * count : (k + 1) * count]
-        summaries.append(summarise(name, of_object, alike[k : k + 1], protocol, "episode"))
-    return tuple(summaries)
 
 
 def _held(trace: Trace, way: Way, tolerance: float, unit: Unit) -> Interval | None:
@@ -430,23 +425,22 @@ def _in_air(trace: Trace, way: Way, unit: Unit) -> InAir:
 
 def _consecutive(trace: Trace, names: Sequence[str]) -> tuple[Consecutive, ...]:
     """Of all objects, and of each."""
-    counts = [_consecutive_of("all", trace)]
-    for k, name in enumerate(names):
-        counts.append(_consecutive_of(name, trace.of([k])))
+    parts = {"all": trace} | {name: trace.of([k]) for k, name in enumerate(names)}
+    counts = []
+    for name, part in parts.items():
+        reached = part.reached
+        full = reached == part.schedule.most
+        counts.append(
+            Consecutive(
+                name,
+                mean=float(reached.mean()),
+                median=float(np.median(reached)),
+                goals=float(reached.sum() / (reached.sum() + (~full).sum())),
+                lost=float((part.fell & ~full).mean()),
+                full=float(full.mean()),
+            )
+        )
     return tuple(counts)
-
-
-def _consecutive_of(name: str, trace: Trace) -> Consecutive:
-    reached = trace.reached
-    full = reached == trace.schedule.most
-    return Consecutive(
-        name,
-        mean=float(reached.mean()),
-        median=float(np.median(reached)),
-        goals=float(reached.sum() / (reached.sum() + (~full).sum())),
-        lost=float((trace.fell & ~full).mean()),
-        full=float(full.mean()),
-    )
 
 
 def summarise(

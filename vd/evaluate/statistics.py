@@ -21,6 +21,8 @@ import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
+from vd.geometry.quaternions import product, rotation_distance
+
 Unit = Literal["object", "episode"]
 
 CONFIDENCE = 0.95
@@ -42,26 +44,6 @@ class Interval:
     gave the bounds."""
 
 
-def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between two rotations in [0, pi], quaternions xyzw [..., 4], broadcast."""
-    # |a - b| and |a + b| stay exact for small angles, where the arc cosine of a dot product does
-    # not.
-    minus = np.linalg.norm(a - b, axis=-1)
-    plus = np.linalg.norm(a + b, axis=-1)
-    return 4.0 * np.arctan2(np.minimum(minus, plus), np.maximum(minus, plus))
-
-
-def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product ``a b`` of quaternions xyzw, shapes [..., 4], broadcast."""
-    a_vector = a[..., :3]
-    a_scalar = a[..., 3:]
-    b_vector = b[..., :3]
-    b_scalar = b[..., 3:]
-    vector = a_scalar * b_vector + b_scalar * a_vector + np.cross(a_vector, b_vector)
-    scalar = a_scalar * b_scalar - np.sum(a_vector * b_vector, axis=-1, keepdims=True)
-    return np.concatenate([vector, scalar], axis=-1)
-
-
 def symmetric_error(
     object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np.ndarray
 ) -> np.ndarray:
@@ -72,8 +54,8 @@ def symmetric_error(
         goal_quat: Goal orientations xyzw, shape [..., 4].
         symmetry: The rotations of the object onto itself, body frame, xyzw, shape [S, 4].
     """
-    turned = quat_multiply(np.asarray(object_quat)[..., None, :], np.asarray(symmetry))
-    return rotation_angle(turned, np.asarray(goal_quat)[..., None, :]).min(axis=-1)
+    turned = product(object_quat[..., None, :], symmetry)
+    return np.asarray(rotation_distance(turned, goal_quat[..., None, :]).min(axis=-1))
 
 
 def choose_unit(num_objects: int) -> Unit:

@@ -425,13 +425,18 @@ def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str
 
 
 def aspect_table(result: Result, groups: dict[str, ObjectGroup]) -> list[dict[str, str]]:
-    """A line for each entry and policy: success of all objects, and of each class of aspect ratio."""
+    """A line for each entry and policy: success of all objects, and of each class of aspect ratio.
+
+    It is the longest by the shortest extent of an object along its principal axes.
+    """
+    from vd.assets_usd.objects.geometry import sides_along_axes
     from vd.assets_usd.objects.sets import load_set
 
     aspects: dict[tuple[str, str], float] = {}
     for name, group in groups.items():
         for item in load_set(group.sets):
-            aspects[name, item.name] = aspect_ratio(item.surface_points)
+            extents = sides_along_axes(item.surface_points)
+            aspects[name, item.name] = float(extents.max() / extents.min())
     table = []
     for row in result.rows:
         if not row.headline:
@@ -448,14 +453,6 @@ def aspect_table(result: Result, groups: dict[str, ObjectGroup]) -> list[dict[st
             line[f"aspect {low:g} to {high:g}"] = f"{mean} of {len(rates)}" if rates else mean
         table.append(line)
     return table
-
-
-def aspect_ratio(points: np.ndarray) -> float:
-    """Longest by shortest extent of points [P, 3] along their principal axes."""
-    centred = points - points.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2]
-    extents = np.ptp(centred @ axes.T, axis=0)
-    return float(extents.max() / extents.min())
 
 
 def paper_figures(result: Result, suite: Suite) -> list[dict[str, str]]:

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from vd.evaluate.goals import ONE_GOAL, GoalSchedule
 from vd.evaluate.rollout import episode_rounds, unit_quats
-from vd.evaluate.statistics import rotation_angle, symmetric_error
+from vd.evaluate.statistics import symmetric_error
+from vd.geometry.quaternions import rotation_distance
 from vd.paper import PAPER
 from vd.policy.stopping import StoppingRule
 
@@ -401,7 +402,7 @@ class _Round:
     def _write_errors(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
         """Write the errors of environments after ``step`` steps."""
         trace = self._trace
-        self._exact[envs] = rotation_angle(quat[envs], self._goal[envs])
+        self._exact[envs] = rotation_distance(quat[envs], self._goal[envs])
         envs = self._at_first(envs)
         if not len(envs):
             return
@@ -478,5 +479,5 @@ class _Round:
             copy_motion(live, state, np.flatnonzero(away))  # or it would fall for half a minute
         place = self._place(envs)
         quat = unit_quats(env.object_pose()[envs, 3:7])
-        error = rotation_angle(quat, self._trace.goal_quat[place])
+        error = rotation_distance(quat, self._trace.goal_quat[place])
         self._trace.held[way][place] = np.where(lost[envs], np.pi, error)

@@ -14,7 +14,7 @@ import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
 from vd.command.files import atomic_path
-from vd.evaluate.statistics import rotation_angle
+from vd.geometry.quaternions import rotation_distance
 from vd.paper import PAPER
 from vd.play.render import Picture, Renderer
 
@@ -100,7 +100,7 @@ class Watcher:
         error = env.rotation_error.numpy()[envs]
         table = env.has_table()[envs]
         if not stepped:  # what the environment holds is of the step before the reset
-            error = rotation_angle(q[:, -4:].astype(float), goal.astype(float))
+            error = rotation_distance(q[:, -4:].astype(float), goal.astype(float))
         return [
             Snapshot(
                 name=env.objects[env.world_object[world]].name,
