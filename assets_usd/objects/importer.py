@@ -169,29 +169,32 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
     source = Path(job.source)
     loaded, load_notes = _simplified(load_mesh(source))
     mesh = repair_mesh(loaded)
-    scale, size_notes, size_warnings = scale_of(settings, mesh.vertices, declared_unit(source))
+    scale, size_notes, size_warnings = scale_of(
+        settings, mesh.surface.vertices, declared_unit(source)
+    )
     mesh = mesh.scaled(scale)
+    surface = mesh.surface
     body = body_of(mesh)
     if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
     mass, mass_notes, mass_warnings = mass_of(settings, body.solid.volume)
-    error_of = error_of_parts(body, mesh.vertices)
+    error_of = error_of_parts(body, surface.vertices)
     if 0 < len(mesh.pieces) <= settings.max_hulls:
         hulls = tidy_hulls([p.vertices for p in mesh.pieces], HULL_VERTICES)
         parts = Decomposition(hulls, "convex pieces", error=error_of(hulls))
     else:
-        coarse = cluster_vertices(mesh.vertices, mesh.faces, MAX_DECOMPOSED_FACES)
-        parts = best_decomposition(*coarse, settings, error_of)
-    offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
-    made = _parts_warnings(parts, offset / np.ptp(mesh.vertices, axis=0).max())
-    drawn = cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES)
-    made += _uncovered(drawn[0], parts.hulls)
+        coarse = cluster_vertices(surface, MAX_DECOMPOSED_FACES)
+        parts = best_decomposition(coarse, settings, error_of)
+    offset = parts.error * body.volume / triangle_areas(surface).sum()
+    made = _parts_warnings(parts, offset / np.ptp(surface.vertices, axis=0).max())
+    drawn = cluster_vertices(surface, MAX_VISUAL_FACES)
+    made += _uncovered(drawn.vertices, parts.hulls)
     return build_model(
         job.name,
-        *drawn,
+        drawn,
         parts.hulls,
         body.solid,
-        surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS),
+        surface_points(surface, SURFACE_POINTS),
         licence=job.licence,
         mass_kg=mass,
         source=job.provenance,
@@ -210,16 +213,16 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
 
 def _simplified(mesh: Any) -> tuple[Any, list[str]]:
     """A mesh of at most MAX_FACES faces, and what has to be said of it."""
-    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, closed=True)
-    if len(faces) == len(mesh.faces):
+    coarse = cluster_vertices(mesh, MAX_FACES, closed=True)
+    if len(coarse.faces) == len(mesh.faces):
         return mesh, []
-    some = random_surface_points(mesh.vertices, mesh.faces, COMPARED, np.random.default_rng(0))
-    off = distances(vertices, faces, some).max() / mesh.extents.max()
+    some = random_surface_points(mesh, COMPARED, np.random.default_rng(0))
+    off = distances(coarse, some).max() / mesh.extents.max()
     note = (
-        f"simplified from {len(mesh.faces)} to {len(faces)} faces, up to {100 * off:.2g} % of its "
-        f"length off"
+        f"simplified from {len(mesh.faces)} to {len(coarse.faces)} faces, up to "
+        f"{100 * off:.2g} % of its length off"
     )
-    return trimesh.Trimesh(vertices, faces, process=False), [note]
+    return trimesh.Trimesh(*coarse, process=False), [note]
 
 
 def import_meshes(

@@ -28,7 +28,7 @@ from vd.assets_usd.objects.contact_layer import (
     author_contact,
     read_contact,
 )
-from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
+from vd.assets_usd.objects.geometry import Hull, Solid, Surface, principal_axes
 from vd.command.files import atomic_path
 from vd.paper import PAPER
 
@@ -140,8 +140,7 @@ class ObjectModel:
 
 def build_model(
     name: str,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    surface: Surface,
     hulls: Sequence[Hull],
     solid: Solid,
     points: np.ndarray,
@@ -153,8 +152,7 @@ def build_model(
 
     Args:
         name: A valid prim name.
-        vertices: Visual mesh [V, 3], m.
-        faces: [T, 3].
+        surface: Visual mesh, m.
         hulls: Collision parts in the same frame.
         solid: Mass properties at density 1 in the same frame.
         points: Surface points [500, 3] in the same frame.
@@ -164,8 +162,8 @@ def build_model(
     moments, quat = principal_axes(solid.inertia * (mass_kg / solid.volume))
     return ObjectModel(
         name=name,
-        vertices=np.asarray(vertices - solid.centroid, dtype=np.float32),
-        faces=np.asarray(faces, dtype=np.int32),
+        vertices=np.asarray(surface.vertices - solid.centroid, dtype=np.float32),
+        faces=np.asarray(surface.faces, dtype=np.int32),
         hulls=tuple(
             Hull(np.asarray(h.vertices - solid.centroid, np.float32), np.asarray(h.faces, np.int32))
             for h in hulls

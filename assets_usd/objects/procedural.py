@@ -11,6 +11,7 @@ from trimesh.util import append_faces
 from vd.assets_usd.objects.bodies import solid_by_points
 from vd.assets_usd.objects.geometry import (
     Hull,
+    Surface,
     hull_depth,
     inside,
     solid_of_mesh,
@@ -87,11 +88,8 @@ def asymmetry(model: ObjectModel) -> float:
     return least / model.longest_side
 
 
-def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of all parts, without those wholly inside another part.
-
-    Vertices [V, 3], faces [T, 3].
-    """
+def union_surface(hulls: Sequence[Hull]) -> Surface:
+    """Triangles of all parts, without those wholly inside another part."""
     vertices = []
     faces = []
     for i, hull in enumerate(hulls):
@@ -102,8 +100,8 @@ def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
         used, index = np.unique(hull.faces[~inside], return_inverse=True)
         vertices.append(hull.vertices[used])
         faces.append(index.reshape(-1, 3))
-    joined, triangles = append_faces(vertices, faces)
-    return joined, triangles.astype(np.int32)
+    corners, triangles = append_faces(vertices, faces)
+    return Surface(corners, triangles.astype(np.int32))
 
 
 def model_of_parts(
@@ -120,16 +118,15 @@ def model_of_parts(
     everything = np.concatenate([h.vertices for h in hulls])
     scale = 1.0 if longest_side is None else longest_side / float(np.ptp(everything, axis=0).max())
     parts = [hull.times(scale) for hull in hulls]
-    vertices, faces = union_surface(parts)
-    points = surface_points(vertices, faces, SURFACE_POINTS, outside=parts)
-    corners, triangles = append_faces(*zip(*parts, strict=True))
-    solid = solid_of_mesh(corners, triangles)
+    surface = union_surface(parts)
+    points = surface_points(surface, SURFACE_POINTS, outside=parts)
+    whole = Surface(*append_faces(*zip(*parts, strict=True)))
+    solid = solid_of_mesh(whole)
     if len(parts) > 1:
-        solid = solid_by_points(corners, partial(inside, corners, triangles), GRID)
+        solid = solid_by_points(whole.vertices, partial(inside, whole), GRID)
     return build_model(
         name,
-        vertices,
-        faces,
+        surface,
         parts,
         solid,
         points,
