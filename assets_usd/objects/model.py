@@ -330,8 +330,8 @@ def read_object(path: Path) -> ObjectModel:
     if data.get("formatVersion") != FORMAT_VERSION:
         raise ObjectError(
             f"{path}: formatVersion is {data.get('formatVersion')}, this version reads "
-            f"{FORMAT_VERSION}; write it again with vd-assets import or vd-assets objects; a "
-            "hand's layer goes to --hand-layer"
+            f"{FORMAT_VERSION}; import it again (vd-assets import); a hand's layer goes to "
+            "--hand-layer"
         )
     stage = Usd.Stage.Open(layer)
     prim = stage.GetDefaultPrim()

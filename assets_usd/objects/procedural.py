@@ -1,6 +1,6 @@
 """Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -174,20 +174,13 @@ def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> Ob
     raise RuntimeError(f"{name}: no valid object in {ATTEMPTS} draws")
 
 
-def procedural_set(
-    count: int,
-    seed: int,
-    *,
-    families: str = "training",
-    progress: Callable[[str, int, int], None] | None = None,
-) -> list[ObjectModel]:
+def procedural_set(count: int, seed: int, *, families: str = "training") -> list[ObjectModel]:
     """Objects of every kind in turn, deterministic from the seed.
 
     Args:
         count: Number of objects.
         seed: Seed of the set. Object i depends on the families, the seed and i alone.
         families: ``training`` or ``heldout`` (``KINDS``).
-        progress: Called with each name, the number done and the number of all.
     """
     kinds = KINDS[families]
     word = list(KINDS).index(families)
@@ -206,8 +199,6 @@ def procedural_set(
             content_hash=f"procedural-{PROCEDURAL_VERSION}-{word}-{seed}-{i}",
         )
         models.append(model)
-        if progress:
-            progress(name, i + 1, count)
     return models
 
 
