@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
+import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull
@@ -59,7 +59,7 @@ ROUNDING_RAD = 1e-5
 
 
 def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) -> Usd.Stage:
-    """The stage of a hand with a kind of fingertip selected, and a layer on top, in the session layer.
+    """The stage of a hand with a kind of fingertip, and a layer on top, in the session layer.
 
     Pass the stage itself, not the path, to ``newton.ModelBuilder.add_usd``: neither is in the file.
 

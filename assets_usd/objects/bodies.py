@@ -140,7 +140,10 @@ def solid_by_points(vertices: np.ndarray, within: Inside, points_along: int = VO
 
 
 def _points_around(vertices: np.ndarray) -> tuple[np.ndarray, float]:
-    """Points [SAMPLES, 3] that fill a box around vertices along their principal axes, and its volume."""
+    """Points [SAMPLES, 3] that fill a box around vertices, and its volume.
+
+    The box lies along their principal axes.
+    """
     axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     along = vertices @ axes.T
     side = (1.0 + 2.0 * MARGIN) * np.ptp(along, axis=0)

@@ -103,7 +103,7 @@ interval.
 
 
 def author_contact(prim: Any, identified: Identified) -> None:
-    """Author what was identified on the spec of an object's root prim, USD's own attributes apart."""
+    """Author what was identified on an object's root prim, USD's own attributes apart."""
     from pxr import Sdf
 
     from vd.assets_usd.hand_layer import author

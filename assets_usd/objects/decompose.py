@@ -163,7 +163,9 @@ def decompose(
 
 
 def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
-    """Parts [V, 3] merged to at most ``most``, each time the two whose common hull adds the least volume.
+    """Parts [V, 3] merged to at most ``most``.
+
+    Each time the two are merged whose common hull adds the least volume.
 
     CoACD merges by the depth of concavities, and fills thin walls and rings more than it has to.
     """

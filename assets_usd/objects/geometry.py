@@ -211,7 +211,10 @@ def simplify_hull(hull: Hull, max_vertices: int) -> Hull:
 
 
 def _tetrahedron(points: np.ndarray) -> list[int]:
-    """Four of points [n, 3]: each is the farthest from their mean, the point, line or plane before."""
+    """Four of points [n, 3].
+
+    Each is the farthest from their mean, or the point, line or plane before.
+    """
     first = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
     away = points - points[first]
     second = int(np.argmax(np.linalg.norm(away, axis=1)))
@@ -334,8 +337,8 @@ def cluster_vertices(surface: Surface, max_faces: int, *, closed: bool = False) 
 
     The finest grid that meets the limit is found by bisection. A cell's vertex minimises the
     squared distance to the planes of the triangles around it (quadric error), which keeps edges
-    sharp; the bounding box is kept. A thin wall becomes a sheet, or is gone where what is ``closed``
-    has to stay so.
+    sharp; the bounding box is kept. A thin wall becomes a sheet, or is gone where what is
+    ``closed`` has to stay so.
     """
     vertices = surface.vertices
     faces = surface.faces
@@ -368,7 +371,10 @@ def cluster_vertices(surface: Surface, max_faces: int, *, closed: bool = False) 
 
 
 def _clustered(surface: Surface, cells: float, *, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
+    """Cell of each vertex [V] on a grid, and the triangles left.
+
+    The grid has ``cells`` along the longest side.
+    """
     away = surface.vertices - surface.vertices.min(axis=0)
     x, y, z = np.floor(away / float(away.max()) * cells).astype(np.int64).T
     most = int(cells) + 1

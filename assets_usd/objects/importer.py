@@ -1,4 +1,4 @@
-"""Import of meshes: one child process a mesh, cached by content, resumable, with refusals by name."""
+"""Import of meshes: a child process each, cached by content, resumable, with refusals by name."""
 
 import hashlib
 import json
@@ -118,7 +118,9 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
 
 
 def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
-    """What has to be said of parts that are so far from the surface, on average, as a share of its length.
+    """What has to be said of parts.
+
+    ``offset`` is how far they are from the surface, on average, as a share of its length.
 
     Raises:
         MeshError: They are too far from the mesh.
@@ -203,7 +205,9 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         split=job.split,
         scale=scale,
         volume_error=parts.error + cavity_share(mesh, body),
-        volume_method=f"{parts.method}; volume in which parts and solid differ; solid: {body.method}",
+        volume_method=(
+            f"{parts.method}; volume in which parts and solid differ; solid: {body.method}"
+        ),
         # A fall-back forced by a limit may not be needed next time.
         content_hash="" if parts.fallback else content_hash(job, settings),
         notes=(*load_notes, *mesh.notes, *size_notes, *mass_notes),

@@ -12,7 +12,7 @@ from vd.paper import PAPER
 
 
 def claimed(claim: Claim, rows: Sequence[Row]) -> Any:
-    """Our figure, from the rows of one policy in an evaluation; None where it has no such figure."""
+    """Our figure, from the rows of one policy in an evaluation; None where it has none."""
     for row in rows:
         if row.stopped_by == claim.stopped_by or (claim.stopped_by is None and row.headline):
             return measured(row, claim.measure)
@@ -20,7 +20,7 @@ def claimed(claim: Claim, rows: Sequence[Row]) -> Any:
 
 
 def measured(row: Row, measure: str) -> Any:
-    """A measure of a row: fields and keys with ``/`` between, or the name of one of these functions.
+    """A measure of a row: fields and keys with ``/`` between, or a name of ``OF_EPISODES``.
 
     None where it has no meaning.
     """

@@ -63,7 +63,7 @@ def shown_name(text: str) -> str:
 
 
 def labels(names: Sequence[str]) -> dict[str, str]:
-    """Short names of policies: the last part of each path where that is another than of all others."""
+    """Short names of policies: the last part of each path where no other has the same."""
     paths = {}
     for name in names:
         path = Path(name)

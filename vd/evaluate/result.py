@@ -210,7 +210,7 @@ class Row:
 
     @property
     def headline(self) -> bool:
-        """Whether it is judged first: by the prediction of who makes one, else by the true distance."""
+        """Whether it is judged first: by the prediction, if there is one, else the true distance."""
         by_prediction = self.sees.endswith("clouds")
         return self.stopped_by == ("prediction" if by_prediction else "true distance")
 
@@ -247,7 +247,7 @@ class Result:
         return headlines
 
     def differences(self) -> list[tuple[Row, Row, Interval]]:
-        """Every other policy beside the first, and how much larger its share of success is, paired."""
+        """Every policy beside the first, and how much larger its share of success is, paired."""
         differences = []
         for row_of in self.headlines().values():
             first, *others = row_of.values()
@@ -340,7 +340,7 @@ def judge(
     group: str,
     condition: str = "",
 ) -> list[Row]:
-    """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
+    """Rows of one policy, one for each way to stop, from its episodes with a group of objects."""
     tolerance = protocol.stop_tolerance_rad
     schedule = trace.schedule
     in_a_row = schedule.most > 1

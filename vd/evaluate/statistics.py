@@ -69,7 +69,7 @@ def share_among(of: np.ndarray, among: np.ndarray) -> float | None:
 
 
 def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
-    """How much larger the rate of some outcomes is than that of others on the same episodes, bool [K, M]."""
+    """How much larger the rate of outcomes is than that of others on the same episodes [K, M]."""
     pairs = outcomes.astype(float) - others
     units = pairs.mean(axis=1)[None] if unit == "object" or pairs.shape[1] == 1 else pairs
     strata, n = units.shape

@@ -234,7 +234,7 @@ def record(
 def drawn_rounds(
     env: "ReorientEnv", episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
-    """Episode number of each environment, -1 for none [N], and its state at the begin, for every round."""
+    """For every round each environment's episode number, -1 for none [N], and state at its begin."""
     world_object = np.asarray(env.world_object)
     drawn = []
     for numbers in episode_rounds(world_object, len(env.objects), episodes):
@@ -268,7 +268,7 @@ def copy_motion(
 
 
 def act_in(env: "ReorientEnv", policy: Any, envs: np.ndarray) -> torch.Tensor:
-    """Actions [N, D]; a policy with ``predicted`` is told that it need not act but in some environments."""
+    """Actions [N, D]; a policy with ``predicted`` is told that only some environments matter."""
     if hasattr(policy, "predicted"):
         policy.active = torch.zeros_like(policy.predicted, dtype=torch.bool)
         policy.active[torch.from_numpy(envs).to(policy.active.device)] = True
@@ -381,7 +381,7 @@ class _Round:
         return envs[self._trace.reached[self._place(envs)] == 0]
 
     def _begin(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
-        """Write down where the first goal begins, ``quat`` [N, 4] being the objects' orientations."""
+        """Write down where the first goal begins; ``quat`` [N, 4] are the objects' orientations."""
         self._trace.start_quat[self._place(envs)] = quat[envs]
         self._trace.goal_quat[self._place(envs)] = self._goal[envs]
         self._write_errors(envs, step, quat)

@@ -120,7 +120,7 @@ class CameraActor:
         self.active = torch.ones(env.num_envs, dtype=torch.bool, device=place)
 
     def surface(self, world: int) -> np.ndarray:
-        """Points on the surface of an environment's object, in the frame that is found [m] [P, 3]."""
+        """Surface points of an environment's object, in the frame that is found [m] [P, 3]."""
         scene = self._env.scene
         return self._surfaces[scene.world_object[world]] * scene.world_scale[world]
 

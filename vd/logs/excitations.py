@@ -150,7 +150,9 @@ MENU: dict[str, tuple[MenuMotion, ...]] = {
 def excitation_set(
     reach: JointRange, names: Sequence[str] = ("steps_and_sines",)
 ) -> list[Trajectory]:
-    """The motions of several sets, in order, joint by joint, with their commands in the place of positions.
+    """The motions of several sets, in order, joint by joint.
+
+    Their commands stand in the place of positions.
 
     Args:
         reach: Joints and limits.

@@ -1,7 +1,7 @@
 """The log of a run in one MCAP file of ROS 2 messages, for Foxglove, PlotJuggler and ``ros2 bag``.
 
-Topics are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose`` (as the
-policy finds it), ``/goal_pose``, ``/depth`` [mm] and ``/events``. Needs the extra ``log``.
+Topics are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose`` (as
+the policy finds it), ``/goal_pose``, ``/depth`` [mm] and ``/events``. Needs the extra ``log``.
 """
 
 import json
@@ -51,7 +51,7 @@ class McapLog:
         self._joints = list(run["joints"])
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
-        """Write a control step, by columns of steps.csv, and the depth image [m] [H, W] that it saw."""
+        """Write a control step, by columns of steps.csv, and the depth image it saw [m] [H, W]."""
         t = row["t"]
         self._write_joints(t, "/joint_states", row, "position", "velocity")
         self._write_joints(row["t_command"], "/joint_commands", row, "command")

@@ -2,7 +2,8 @@
 
 LeRobot datasets, ROS bags and MCAP, BAM's logs, CSV with units.
 
-Every reader yields a :class:`SourceMotion` for each episode, bag or file. ``FORMATS`` has them by name.
+Every reader yields a :class:`SourceMotion` for each episode, bag or file. ``FORMATS`` has them by
+name.
 """
 
 import json
