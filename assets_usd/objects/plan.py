@@ -19,7 +19,8 @@ GENERIC_WORDS = frozenset(
         r"\w+",
         """asset clean cleaned collision convex decimated export exported geometry glb google
         highres lowres merged mesh meshes model models nontextured normalized obj object objects
-        output ply poisson processed scan scene simple simplified stl textured tsdf untitled usd visual watertight""",
+        output ply poisson processed scan scene simple simplified stl textured tsdf untitled usd
+        visual watertight""",
     )
 )
 """Words that say what kind of file something is, not of what thing. Data sets have a folder for

@@ -127,7 +127,7 @@ def prism(outline: npt.ArrayLike, low: float, high: float, *, axis: str = "y") -
 
 
 def beam(start: npt.ArrayLike, end: npt.ArrayLike, width: float, depth: float) -> Hull:
-    """Flat stroke between two points of the x-z plane, ``width`` wide and ``depth`` thick along y."""
+    """Flat stroke between two points of the x-z plane, ``width`` wide, ``depth`` thick along y."""
     a = np.asarray(start, dtype=float)
     b = np.asarray(end, dtype=float)
     along = (b - a) / np.linalg.norm(b - a)

@@ -40,8 +40,8 @@ CUBOID_SIDES_M = (0.05, 0.07, 0.10)
 
 THINNEST_M = 0.015
 """Least shortest side of an object that would be longer than ``LONGEST_SIDE_M`` where it is as
-thick as other objects. What is flatter is out of reach where it lies: straight fingers of dclaw4 end 9 mm
-above the table under their roots, 17 mm above it in the middle.
+thick as other objects. What is flatter is out of reach where it lies: straight fingers of dclaw4
+end 9 mm above the table under their roots, 17 mm above it in the middle.
 """
 
 MIN_ASYMMETRY = 0.012

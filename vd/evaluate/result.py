@@ -210,7 +210,7 @@ class Row:
 
     @property
     def headline(self) -> bool:
-        """Whether it is judged first: by the prediction, if there is one, else the true distance."""
+        """Whether it is judged first: by the prediction if there is one, else the true distance."""
         by_prediction = self.sees.endswith("clouds")
         return self.stopped_by == ("prediction" if by_prediction else "true distance")
 

@@ -234,7 +234,7 @@ def record(
 def drawn_rounds(
     env: "ReorientEnv", episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
-    """For every round each environment's episode number, -1 for none [N], and state at its begin."""
+    """For every round the environments' episode numbers, -1 for none [N], and first state."""
     world_object = np.asarray(env.world_object)
     drawn = []
     for numbers in episode_rounds(world_object, len(env.objects), episodes):

@@ -5,8 +5,8 @@ Written by vd-deploy as it goes, replayed by vd-play, read by vd-gap.
 A folder. ``steps.csv`` has a row for every control step, appended whole, so that a log cut short by
 a crash is a log. ``recording.json`` beside it makes the folder a recording
 (:mod:`vd.logs.recording`). ``run.json`` says what ran, and at the end how it ended;
-``events.jsonl`` has goals, stops and faults. SI units, radians, world frame, quaternions xyzw; times are seconds
-since the start. A row is a state, read at ``t``, and the goals that were sent after it, at
+``events.jsonl`` has goals, stops and faults. SI units, radians, world frame, quaternions xyzw;
+times are seconds since the start. A row is a state, read at ``t``, and the goals that were sent after it, at
 ``t_command``.
 """
 

@@ -90,7 +90,7 @@ class PictureCamera:
         )
 
     def aimed_at(self, point: Sequence[float], radius: float) -> "PictureCamera":
-        """A camera that looks the same way at a ball about ``point`` [m], which fills the picture."""
+        """A camera that looks the same way at a ball about ``point`` [m], which fills its picture."""
         distance = radius / math.sin(math.atan(BALL_SHARE * math.tan(0.5 * self.fov)))
         eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
         return replace(self, eye=_vector(eye), target=_vector(point))
