@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from vd.evaluate.result import Row
-from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
+from vd.evaluate.statistics import Interval, rate_intervals
 from vd.evaluate.suite import Claim
 from vd.paper import PAPER
 
@@ -47,8 +47,7 @@ def success_without_table(row: Row) -> Interval:
 
 
 def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
-    objects = len(row.object_names)
-    return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
+    return rate_intervals(np.reshape(chosen, (1, len(row.object_names), -1)))[0]
 
 
 OF_EPISODES = {"lost_at_once": lost_at_once, "success_without_table": success_without_table}

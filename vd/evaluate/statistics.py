@@ -68,9 +68,12 @@ def share_among(of: np.ndarray, among: np.ndarray) -> float | None:
     return float(of[among].mean()) if among.any() else None
 
 
-def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
+def paired_difference(
+    outcomes: np.ndarray, others: np.ndarray, unit: Unit | None = None
+) -> Interval:
     """How much larger the rate of outcomes is than that of others on the same episodes [K, M]."""
     pairs = outcomes.astype(float) - others
+    unit = unit or choose_unit(len(pairs))
     units = pairs.mean(axis=1)[None] if unit == "object" or pairs.shape[1] == 1 else pairs
     strata, n = units.shape
     half = np.inf
@@ -81,7 +84,7 @@ def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> I
     return Interval(mean, max(mean - half, -1.0), min(mean + half, 1.0), "paired-t")
 
 
-def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
+def rate_intervals(outcomes: np.ndarray, unit: Unit | None = None) -> list[Interval]:
     """Rates of yes/no outcomes with 95 % intervals.
 
     Where all units are equal (no success at all, say), nothing is known of how they differ, and the
@@ -89,10 +92,10 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
 
     Args:
         outcomes: Booleans, or shares in [0, 1], shape [R, K, M] for R rates.
-        unit: What the statement is about.
+        unit: What the statement is about; by default as :func:`choose_unit` says.
     """
     outcomes = np.asarray(outcomes, dtype=float)
-    lows, highs = _logit_t(outcomes, unit)
+    lows, highs = _logit_t(outcomes, unit or choose_unit(outcomes.shape[1]))
     intervals = []
     for group, low, high in zip(outcomes, lows, highs, strict=True):
         rate = float(group.mean())
@@ -134,7 +137,7 @@ def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
     return expit(odds(total) - half), expit(odds(total) + half)
 
 
-def median_interval(values: np.ndarray, unit: Unit) -> Interval:
+def median_interval(values: np.ndarray, unit: Unit | None = None) -> Interval:
     """Median of finite values [K, M] with its 95 % interval."""
     values = np.asarray(values, dtype=float)
     median = float(np.median(values))

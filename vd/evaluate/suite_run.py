@@ -408,7 +408,7 @@ def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str
             change = NOTHING
             if entry.name != first and (first, policy) in row_of and row.in_air is None:
                 nominal = row_of[first, policy]
-                difference = paired_difference(row.successes, nominal.successes, row.overall.unit)
+                difference = paired_difference(row.successes, nominal.successes)
                 change = points(difference)
             table.append(
                 {
