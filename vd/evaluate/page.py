@@ -82,11 +82,13 @@ def shortened(result: Result) -> Result:
     return replace(result, rows=rows)
 
 
-def percent(interval: Interval | None) -> str:
-    """``12.3 % (10.1 to 14.9)``, or for None that it was not tried."""
-    if interval is None:
-        return "not tried"
-    return f"{100 * interval.value:.1f} % ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+def percent(rate: Interval | float | None) -> str:
+    """``12.3 % (10.1 to 14.9)``, without its interval ``12.3 %``, or a dash for None."""
+    if rate is None:
+        return NOTHING
+    if isinstance(rate, Interval):
+        return f"{100 * rate.value:.1f} % ({100 * rate.low:.1f} to {100 * rate.high:.1f})"
+    return f"{100 * rate:.1f} %"
 
 
 def number(interval: Interval | None) -> str:
@@ -101,11 +103,6 @@ def points(difference: Interval) -> str:
     low = 100 * difference.low
     high = 100 * difference.high
     return f"{100 * difference.value:+.1f} points ({low:+.1f} to {high:+.1f})"
-
-
-def share(value: float | None) -> str:
-    """``12.3 %``, or that there is none."""
-    return "none" if value is None else f"{100 * value:.1f} %"
 
 
 def write_page(
@@ -294,10 +291,10 @@ def _air_table(rows: Sequence[Row]) -> Table:
                     row.policy,
                     _where(row),
                     percent(air.held),
-                    share(air.first),
+                    percent(air.first),
                     percent(air.in_a_row),
-                    share(air.lost),
-                    share(air.let_go),
+                    percent(air.lost),
+                    percent(air.let_go),
                 )
             )
     return _AIR_HEADER, lines
@@ -316,9 +313,9 @@ def _consecutive_table(rows: Sequence[Row]) -> Table:
                     _where(row) if count.name == "all" else count.name,
                     f"{count.mean:.1f}",
                     f"{count.median:g}",
-                    share(count.goals),
-                    share(count.lost),
-                    share(count.full),
+                    percent(count.goals),
+                    percent(count.lost),
+                    percent(count.full),
                 )
             )
     return _CONSECUTIVE_HEADER, lines
@@ -337,8 +334,8 @@ def _bound_table(rows: Sequence[Row]) -> Table:
                     row.policy,
                     _where(row),
                     bound,
-                    share(seen),
-                    share(prediction.right[bound]),
+                    percent(seen),
+                    percent(prediction.right[bound]),
                     f"{prediction.mean_error_rad:.2f}",
                 )
             )

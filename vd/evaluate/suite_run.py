@@ -29,7 +29,16 @@ from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.claims import claimed
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
-from vd.evaluate.page import NOTHING, labels, number, points, shortened, shown_name, write_page
+from vd.evaluate.page import (
+    NOTHING,
+    labels,
+    number,
+    percent,
+    points,
+    shortened,
+    shown_name,
+    write_page,
+)
 from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
@@ -37,11 +46,12 @@ from vd.evaluate.suite import (
     QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
+    Claim,
     Suite,
     SuiteEntry,
     read_suite,
-    share_text,
 )
+from vd.paper import PAPER
 from vd.policy.agents import find_policy, has_no_file, open_policy, sees_clouds
 
 SETTINGS_FILE = "settings.json"
@@ -415,10 +425,10 @@ def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str
                     "condition": entry.name,
                     "changed": shown(entry),
                     "policy": policy,
-                    "success": _share(row.overall.outcomes["success"]),
+                    "success": percent(row.overall.outcomes["success"]),
                     f"points from {first}": change,
-                    "within 0.1 rad": _share(row.precise),
-                    "lost": _share(row.overall.outcomes["object falls"]),
+                    "within 0.1 rad": percent(row.precise),
+                    "lost": percent(row.overall.outcomes["object falls"]),
                 }
             )
     return table
@@ -442,14 +452,14 @@ def aspect_table(result: Result, groups: dict[str, ObjectGroup]) -> list[dict[st
         if not row.headline:
             continue
         line = {"condition": row.condition, "policy": row.policy}
-        line["success"] = _share(row.overall.outcomes["success"])
+        line["success"] = percent(row.overall.outcomes["success"])
         for low, high in pairwise(ASPECTS):
             rates = [
                 item.outcomes["success"].value
                 for item in row.per_object
                 if low <= aspects[row.group, item.name] < high
             ]
-            mean = share_text(float(np.mean(rates))) if rates else NOTHING
+            mean = percent(float(np.mean(rates))) if rates else NOTHING
             line[f"aspect {low:g} to {high:g}"] = f"{mean} of {len(rates)}" if rates else mean
         table.append(line)
     return table
@@ -465,20 +475,25 @@ def paper_figures(result: Result, suite: Suite) -> list[dict[str, str]]:
             figure = {
                 "figure": claim.text,
                 "condition": entry.name,
-                "paper": claim.paper_text() or NOTHING,
+                "paper": paper_text(claim),
             }
             for policy in result.policies:
                 rows = [r for r in result.rows if (r.condition, r.policy) == (entry.name, policy)]
                 value = claimed(claim, rows)
                 in_unit = claim.unit != "share" and isinstance(value, Interval)
-                figure[policy] = number(value) if in_unit else _share(value)
+                figure[policy] = number(value) if in_unit else percent(value)
             figures.append(figure)
     return figures
 
 
-def _share(rate: Interval | float | None) -> str:
-    if rate is None:
+def paper_text(claim: Claim) -> str:
+    """What the paper says: ``96.0 % (94.0 to 97.0)``, ``0.12 to 0.13``, ``below 7``."""
+    if claim.paper is None:
         return NOTHING
-    if isinstance(rate, Interval):
-        return share_text(rate.value, rate.low, rate.high)
-    return share_text(rate)
+    values: tuple[float, ...] = getattr(PAPER.results, claim.paper)
+    if claim.unit == "rad":
+        low, high = values
+        return f"{low:.2f} to {high:.2f}"
+    if claim.unit == "s":
+        return f"below {values[0]:g}"
+    return percent(Interval(*values, method="") if values[1:] else values[0])
