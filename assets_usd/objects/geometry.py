@@ -319,19 +319,6 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-def _tidied(faces: np.ndarray, *, closed: bool) -> np.ndarray:
-    """Triangles [T, 3], each once: a thin wall becomes a sheet.
-
-    ``closed``: of those with equal corners, an even number goes, so that what is closed stays so.
-    """
-    from trimesh.grouping import unique_rows
-
-    first, group = unique_rows(np.sort(faces, axis=1))
-    if closed:
-        first = first[np.bincount(group) % 2 == 1]
-    return np.asarray(faces[np.sort(first)])
-
-
 def cluster_vertices(surface: Surface, max_faces: int, *, closed: bool = False) -> Surface:
     """Coarsen a mesh to at most ``max_faces`` triangles by merging the vertices of a grid cell.
 
@@ -373,15 +360,22 @@ def cluster_vertices(surface: Surface, max_faces: int, *, closed: bool = False) 
 def _clustered(surface: Surface, cells: float, *, closed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Cell of each vertex [V] on a grid, and the triangles left.
 
-    The grid has ``cells`` along the longest side.
+    The grid has ``cells`` along the longest side. Each triangle is there once: a thin wall becomes
+    a sheet. What is ``closed`` stays so.
     """
+    from trimesh.grouping import unique_rows
+
     away = surface.vertices - surface.vertices.min(axis=0)
     x, y, z = np.floor(away / float(away.max()) * cells).astype(np.int64).T
     most = int(cells) + 1
     cell = np.unique((x * most + y) * most + z, return_inverse=True)[1].reshape(-1)
     merged = cell[surface.faces]
     a, b, c = merged.T
-    return cell, _tidied(merged[(a != b) & (b != c) & (c != a)], closed=closed)
+    merged = merged[(a != b) & (b != c) & (c != a)]
+    first, group = unique_rows(np.sort(merged, axis=1))
+    if closed:  # of triangles with equal corners an even number goes
+        first = first[np.bincount(group) % 2 == 1]
+    return cell, merged[np.sort(first)]
 
 
 def _quadric_vertices(surface: Surface, cluster: np.ndarray, cell: float) -> np.ndarray:
