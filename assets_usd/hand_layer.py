@@ -113,9 +113,8 @@ def write_layer(
         ValueError: An unknown joint.
     """
     names = [*dict.fromkeys([*baseline, *effects])]
-    root = hand
+    root = hand if isinstance(hand, str) else hand.name
     if not isinstance(hand, str):
-        root = hand.name
         names.sort(key=hand.joint_names.index)
     layer = new_layer(
         root,

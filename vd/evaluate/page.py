@@ -198,8 +198,8 @@ def ecdf_figure(result: Result) -> "Figure":
     headlines = result.headlines()
     columns = min(PANELS, len(headlines))
     rows = -(-len(headlines) // columns)
-    size = np.multiply((columns, rows), PANEL_INCH)
-    figure = Figure(figsize=size, layout="constrained")
+    width, height = PANEL_INCH
+    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
     angle = np.linspace(0.0, np.pi, 200)
     by_chance = (angle - np.sin(angle)) / np.pi  # of orientations uniform on SO(3)
     colour = dict(zip(result.policies, COLOURS * len(result.policies), strict=False))

@@ -496,4 +496,7 @@ def paper_text(claim: Claim) -> str:
         return f"{low:.2f} to {high:.2f}"
     if claim.unit == "s":
         return f"below {values[0]:g}"
-    return percent(Interval(*values, method="") if values[1:] else values[0])
+    if len(values) == 1:
+        return percent(values[0])
+    value, low, high = values
+    return percent(Interval(value, low, high, ""))

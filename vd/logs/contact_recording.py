@@ -86,7 +86,7 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
     )
     table = _frame(file, "table_pose", header)
     tracked = _frame(file, "object_pose", header)
-    entries = header.get("trajectories")
+    entries = header.get("trajectories", [])
     require(
         bool(entries) and isinstance(entries, list),
         f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}",
