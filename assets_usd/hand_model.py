@@ -138,7 +138,10 @@ def read_surfaces(hand: HandModel) -> dict[int, Surface]:
 
 def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
     """Each entry of rows as an array; names are fields of :class:`HandModel`."""
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    columns = {}
+    for name in rows[0]:
+        columns[name] = np.array([row[name] for row in rows])
+    return columns
 
 
 class _Reader:

@@ -146,7 +146,7 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
                 f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} "
                 f"high"
             )
-        identified[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
+        identified[name] = tuple(tuple(part.tolist()) for part in (value, low, high))
     return identified
 
 

@@ -413,6 +413,5 @@ def write_contact_layer(
 
 def object_files(folder: Path) -> list[Path]:
     """The object files of a set's folder, sorted by name."""
-    return sorted(
-        p for p in Path(folder).iterdir() if p.suffix in SUFFIXES and not p.name.startswith(".")
-    )
+    files = sorted(Path(folder).glob("[!.]*"))
+    return [file for file in files if file.suffix in SUFFIXES]

@@ -178,9 +178,11 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
             + f"{more}\nName only the files that you want (such as FOLDER/*/textured.obj), "
             "rename one, or import one into another set (--out)"
         )
-    sidecars = {folder: read_sidecar(folder) for folder in {mesh.parent for mesh in taken.values()}}
+    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
     jobs = []
     for name, mesh in taken.items():
+        if mesh.parent not in sidecars:
+            sidecars[mesh.parent] = read_sidecar(mesh.parent)
         row = sidecars[mesh.parent].get(mesh.stem, {})
         source = row.get("source") or ""
         bracket = re.search(r"\(([^)]*)\)", source)

@@ -165,7 +165,7 @@ def read_columns(file: Path) -> dict[str, np.ndarray]:
         for number, row in enumerate(rows, 2):
             if len(row) != len(header):
                 raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
-        values = np.array([[float(cell) for cell in row] for row in rows])
+        values = np.array(rows, dtype=float)
     except ValueError as error:
         raise LogError(f"{file} is damaged ({error}); copy the whole folder again") from error
     if not rows:
