@@ -4,10 +4,9 @@ import statistics
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -25,30 +24,17 @@ WORST_SHOWN = 3
 
 @dataclass(frozen=True)
 class Hand:
-    """Say where the USD files of the D'Claw hands are, or copy them."""
+    """Say where the USD files of hands are."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Hands; all of them by default."""
-    out: Path | None = None
-    """Folder to copy them to."""
+    """Hands; those of the package by default."""
 
     def run(self) -> int:
-        """Name or copy hands."""
+        """Name files."""
         from vd.assets_usd.hands import HANDS, hand_usd
-        from vd.command.files import write_text
 
-        paths = [hand_usd(name) for name in self.names or HANDS]
-        for path in paths:
-            if self.out is not None:
-                target = self.out / path.name
-                text = path.read_text()
-                if target.exists() and target.read_text(errors="replace") != text:
-                    raise ValueError(
-                        f"{target} is there and another hand; write to another folder (--out)"
-                    )
-                write_text(target, text)
-                path = target
-            print(path)
+        for name in self.names or HANDS:
+            print(hand_usd(name))
         return 0
 
 
@@ -82,43 +68,6 @@ class HandImport:
 
 
 @dataclass(frozen=True)
-class Objects:
-    """Author a set of procedural objects. Commands also author it when they are told its name.
-
-    The cube and the cuboid are the sets cube, cuboid and symmetric.
-    """
-
-    procedural: int = 150
-    """Number of objects."""
-    seed: int = 0
-    """Seed of the set; equal seeds give equal objects."""
-    families: Literal["training", "heldout"] = "training"
-    """heldout: kinds that training lacks."""
-    out: Path | None = None
-    """Folder to write to; by default the named set in the asset cache (such as
-    procedural-150-seed0).
-    """
-
-    def run(self) -> int:
-        """Author procedural objects."""
-        from vd.assets_usd.objects import procedural, sets
-
-        if self.procedural < 1 or self.seed < 0:
-            raise ValueError("--procedural must be at least 1 and --seed at least 0")
-        if self.out is not None:
-            sets.check_set_folder(self.out)
-        kinds = "" if self.families == "training" else f"{self.families}-"
-        name = f"procedural-{kinds}{self.procedural}-seed{self.seed}"
-        folder = self.out or sets.built_in_folder(name)
-        models = procedural.procedural_set(
-            self.procedural, self.seed, families=self.families, progress=_bar("authoring")
-        )
-        size = sum(path.stat().st_size for path in sets.write_set(folder, models))
-        print(f"{len(models)} objects, {size / 1e6:.1f} MB in {folder}")
-        return 0
-
-
-@dataclass(frozen=True)
 class Import:
     """Import meshes (OBJ, STL, PLY, GLB, USD): repair, scale, decompose, one USD per object.
 
@@ -142,22 +91,26 @@ class Import:
 
     def run(self) -> int:
         """Import meshes; returns 1 if any was refused."""
-        from vd.assets_usd.objects.importer import import_meshes
+        from tqdm import tqdm
+
+        from vd.assets_usd.objects.importer import ImportResult, import_meshes
         from vd.assets_usd.objects.plan import default_set
 
         if not self.paths:
             raise ValueError("name the mesh files, or folders of them, to import")
         out = self.out or default_set(self.paths)
-        bar = _bar("importing")
         start = time.monotonic()
         try:
-            results = import_meshes(
-                self.paths,
-                out,
-                self.settings,
-                jobs=self.jobs,
-                progress=lambda result, done, total: bar(result.job.name, done, total),
-            )
+            with tqdm(desc="importing", unit="object", mininterval=0.5) as bar:
+
+                def advance(result: ImportResult, done: int, total: int) -> None:
+                    bar.total = total
+                    bar.set_postfix_str(result.job.name, refresh=False)
+                    bar.update()
+
+                results = import_meshes(
+                    self.paths, out, self.settings, jobs=self.jobs, progress=advance
+                )
         except KeyboardInterrupt:
             print(
                 f"\ninterrupted; what is finished is in {out}; the same command goes on from there",
@@ -190,70 +143,40 @@ class Show:
 Command = (
     Annotated[Hand, tyro.conf.subcommand("hand")]
     | Annotated[HandImport, tyro.conf.subcommand("hand-import")]
-    | Annotated[Objects, tyro.conf.subcommand("objects")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Show, tyro.conf.subcommand("show")]
 )
 
 
-def _bar(label: str) -> Callable[[str, int, int], None]:
-    """A progress bar on standard error, to be called with a name, the number done and the number of all."""
-    bars: list[Any] = []
-
-    def advance(name: str, done: int, total: int) -> None:
-        from tqdm import tqdm
-
-        if not bars:
-            bars.append(tqdm(total=total, desc=label, unit="object", mininterval=0.5))
-        bars[0].set_postfix_str(name, refresh=False)
-        bars[0].update(done - bars[0].n)
-        if done == total:
-            bars[0].close()
-
-    return advance
-
-
 def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
     """What became of an import, in a few lines."""
     count = Counter(result.status for result in results)
+    refusals = []
+    models = []
+    for result in results:
+        if result.model is None:
+            refusals.append(f"refused {result.job.source}: {result.reason}")
+        else:
+            models.append(result.model)
     lines = [
         f"{count['imported']} imported, {count['cached']} unchanged, {count['refused']} refused in "
         f"{seconds:.0f} s; {out}"
     ]
-    warnings = []
-    refusals = []
-    models = []
-    size = 0
-    scaled = 0
-    for result in results:
-        model = result.model
-        if model is None:
-            refusals.append(f"refused {result.job.source}: {result.reason}")
-            continue
-        models.append(model)
-        size += Path(result.job.target).stat().st_size
-        scaled += any("scaled by" in note for note in model.notes)
-        warnings += [f"warning {model.name}: {text}" for text in model.warnings]
     if models:
-        models.sort(key=lambda model: -model.volume_error)
         hulls = statistics.mean(len(model.hulls) for model in models)
-        median = statistics.median(model.volume_error for model in models)
-        worst = ", ".join(
-            f"{model.name} {model.volume_error:.1%}" for model in models[:WORST_SHOWN]
-        )
-        lengths = _span([model.longest_side for model in models])
-        masses = _span([model.mass_kg for model in models])
+        errors = sorted(models, key=lambda model: -model.volume_error)[:WORST_SHOWN]
+        worst = ", ".join(f"{model.name} {model.volume_error:.1%}" for model in errors)
+        scaled = sum("scaled by" in " ".join(model.notes) for model in models)
+        lengths = sorted(model.longest_side for model in models)
+        masses = sorted(model.mass_kg for model in models)
         lines += [
-            f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB",
-            f"volume error of the parts: median {median:.1%}, worst {worst}",
-            f"longest side {lengths} m ({scaled} of {len(models)} scaled), mass {masses} kg",
+            f"{hulls:.1f} convex parts on average; largest volume error of parts: {worst}",
+            f"longest side {lengths[0]:.3g} to {lengths[-1]:.3g} m ({scaled} of {len(models)} "
+            f"scaled), mass {masses[0]:.3g} to {masses[-1]:.3g} kg",
         ]
-    return "\n".join([*lines, *warnings, *refusals])
-
-
-def _span(values: list[float]) -> str:
-    """Least and largest of some values; one where they are equal."""
-    return "-".join(dict.fromkeys([f"{min(values):.3g}", f"{max(values):.3g}"]))
+    for model in models:
+        lines += [f"warning {model.name}: {text}" for text in model.warnings]
+    return "\n".join([*lines, *refusals])
 
 
 @interrupt.command("vd-assets")
@@ -265,7 +188,7 @@ def main() -> int:
     command = parse(Command, words, prog="vd-assets", description=__doc__)
     if isinstance(command, Show):
         check_file(command.out)
-    elif command.out is not None:
+    elif isinstance(command, Import | HandImport) and command.out is not None:
         check_folder(command.out)
     return command.run()
 

@@ -381,7 +381,10 @@ def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def placed(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points [3] or [N, 3] of the frame of a pose [7], or each of its own [N, 7], in the outer frame."""
+    """Points [3] or [N, 3] of the frame of a pose in the outer frame.
+
+    The pose is one [7], or each has its own [N, 7].
+    """
     return np.asarray(Rotation.from_quat(pose[..., 3:]).apply(points) + pose[..., :3])
 
 

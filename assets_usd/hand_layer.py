@@ -17,7 +17,7 @@ on ``/servo/<joint>`` or ``/pendulum/<joint>``.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,16 +71,20 @@ class _Number(NamedTuple):
         return f"{NAMESPACE}:{self.group}:{self.parameter.name}{INTERVAL}"
 
 
-_NUMBERS: dict[str, dict[str, _Number]] = {
-    BASELINE_GROUP: {p.name: _Number(BASELINE_GROUP, p, *DRIVE[p.name]) for p in BASELINE},
-    **{
-        name: {
-            p.name: _Number(name, p, f"{NAMESPACE}:{name}:{p.name}", 1.0) for p in effect.parameters
-        }
-        for name, effect in EFFECTS.items()
-    },
-}
-"""Every number of a servo model, by effect (or the baseline) and parameter."""
+def _numbers() -> dict[str, dict[str, _Number]]:
+    """Every number of a servo model, by effect (or the baseline) and parameter."""
+    numbers = {
+        BASELINE_GROUP: {p.name: _Number(BASELINE_GROUP, p, *DRIVE[p.name]) for p in BASELINE}
+    }
+    for group, effect in EFFECTS.items():
+        numbers[group] = {}
+        for parameter in effect.parameters:
+            attribute = f"{NAMESPACE}:{group}:{parameter.name}"
+            numbers[group][parameter.name] = _Number(group, parameter, attribute, 1.0)
+    return numbers
+
+
+_NUMBERS = _numbers()
 
 
 def write_layer(
@@ -104,16 +108,13 @@ def write_layer(
         recording: Which recording it was identified from.
 
     Raises:
-        HandError: An unknown joint, effect or parameter, or a number that cannot be one; names it.
+        HandError: The file is not to be a ``.usda``.
+        KeyError: An unknown effect or parameter.
+        ValueError: An unknown joint.
     """
-    root = hand if isinstance(hand, str) else hand.name
     names = [*dict.fromkeys([*baseline, *effects])]
+    root = hand if isinstance(hand, str) else hand.name
     if not isinstance(hand, str):
-        for name in names:
-            if name not in hand.joint_names:
-                raise HandError(
-                    f"{path}: {root} has no joint {name!r}; it has {', '.join(hand.joint_names)}"
-                )
         names.sort(key=hand.joint_names.index)
     layer = new_layer(
         root,
@@ -125,11 +126,9 @@ def write_layer(
     top = Sdf.PrimSpec(layer, root, Sdf.SpecifierOver)
     for name in names:
         joint = Sdf.PrimSpec(top, name, Sdf.SpecifierOver)
-        where = f"{path}: {joint.path}"
-        if name in baseline:
-            _write_numbers(where, joint, BASELINE_GROUP, baseline[name])
+        _write_numbers(joint, BASELINE_GROUP, baseline.get(name, {}))
         for effect, values in effects.get(name, {}).items():
-            _write_numbers(where, joint, effect, values)
+            _write_numbers(joint, effect, values)
     save_layer(layer, path)
 
 
@@ -289,53 +288,57 @@ def read_servo(
             rows[:, parameter.column] = baseline[parameter.name]
     for row, interval, joint in zip(rows, intervals, joints, strict=True):
         where = f"{source}: {joint.GetPath()}"
-        valued: dict[str, set[str]] = {BASELINE_GROUP: {p.name for p in BASELINE}}
-        ranges: dict[str, _Number] = {}
-        for name, number, is_interval, value in _authored(where, joint):
+        given: dict[str, set[str]] = {BASELINE_GROUP: {p.name for p in BASELINE}}
+        ranges: list[_Number] = []
+        for attribute in joint.GetAuthoredPropertiesInNamespace(NAMESPACE):
+            name = attribute.GetName()
+            if name.split(":")[1] in DESCRIPTION_GROUPS:
+                continue
+            number = _number_of(where, name)
             parameter = number.parameter
-            if is_interval:
+            value = attribute.Get() if isinstance(attribute, Usd.Attribute) else None
+            if name == number.interval:
                 interval[parameter.column] = _interval(where, name, parameter, value)
-                ranges[name] = number
+                ranges.append(number)
             else:
                 row[parameter.column] = _checked(where, name, parameter, value)
-                valued.setdefault(number.group, set()).add(parameter.name)
-        for name, number in ranges.items():
-            if number.parameter.name not in valued.get(number.group, ()):
+                given.setdefault(number.group, set()).add(parameter.name)
+        for number in ranges:
+            if number.parameter.name not in given.get(number.group, ()):
                 raise HandError(
-                    f"{where}: '{name}' is an interval without a value; author the value too"
+                    f"{where}: '{number.interval}' is an interval without a value; author the "
+                    "value too"
                 )
-        for group, given in valued.items():
-            _check_complete(where, group, given)
+        for group, names in given.items():
+            _check_complete(where, group, names)
     return rows, intervals
 
 
-def _authored(where: str, joint: Usd.Prim) -> Iterator[tuple[str, _Number, bool, object]]:
-    """Name, number, whether it is its interval, and value of each attribute of ours that a joint authors."""
-    for attribute in joint.GetAuthoredPropertiesInNamespace(NAMESPACE):
-        name = attribute.GetName()
-        group = name.split(":")[1]
-        if group in DESCRIPTION_GROUPS:
-            continue
-        if group not in _NUMBERS:
-            raise HandError(
-                f"{where}: '{name}': no effect is called {group!r}; one of {', '.join(EFFECTS)}"
-            )
-        known = {number.attribute: (number, False) for number in _NUMBERS[group].values()}
-        known |= {number.interval: (number, True) for number in _NUMBERS[group].values()}
-        if name not in known:
-            raise HandError(
-                f"{where}: '{name}' is no attribute of {group}; one of {', '.join(known)}"
-            )
-        yield name, *known[name], attribute.Get() if isinstance(attribute, Usd.Attribute) else None
-
-
-def _check_complete(where: str, group: str, given: "set[str] | Mapping[str, Estimate]") -> None:
+def _check_complete(where: str, group: str, given: set[str]) -> None:
     """Refuse an effect without a parameter that has no value at which it does nothing."""
     for name, number in _NUMBERS[group].items():
-        if group != BASELINE_GROUP and number.parameter.lower > 0.0 and name not in given:
+        if number.parameter.lower > 0.0 and name not in given:
             raise HandError(
                 f"{where}: {group} lacks '{number.attribute}'; author it, or remove {group}"
             )
+
+
+def _number_of(where: str, attribute: str) -> _Number:
+    """The number whose value or interval an attribute of a joint is."""
+    group = attribute.split(":")[1]
+    if group not in _NUMBERS:
+        raise HandError(
+            f"{where}: '{attribute}': no effect is called {group!r}; one of {', '.join(EFFECTS)}"
+        )
+    known = []
+    for number in _NUMBERS[group].values():
+        if attribute in (number.attribute, number.interval):
+            return number
+        known.append(number.attribute)
+    raise HandError(
+        f"{where}: '{attribute}' is no attribute of {group}; one of {', '.join(known)}, or their "
+        f"intervals ({INTERVAL})"
+    )
 
 
 def _checked(where: str, name: str, parameter: Parameter, value: object) -> float:
@@ -372,33 +375,18 @@ def _interval(where: str, name: str, parameter: Parameter, value: object) -> tup
     return low, high
 
 
-def _write_numbers(
-    where: str, joint: Sdf.PrimSpec, group: str, values: Mapping[str, Estimate]
-) -> None:
+def _write_numbers(joint: Sdf.PrimSpec, group: str, values: Mapping[str, Estimate]) -> None:
     """Author the numbers of an effect, or of the baseline, on a joint."""
-    if group not in _NUMBERS:
-        raise HandError(f"{where}: no effect is called {group!r}; one of {', '.join(EFFECTS)}")
-    known = _NUMBERS[group]
-    _check_complete(where, group, values)
     for name, estimate in values.items():
-        if name not in known:
-            raise HandError(
-                f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}"
-            )
-        number = known[name]
+        number = _NUMBERS[group][name]
         unit = number.parameter.unit
-        value, *bounds = np.atleast_1d(estimate).tolist()
+        value, *ends = np.atleast_1d(estimate).tolist()
         ours = number.attribute.startswith(f"{NAMESPACE}:")
-        author(
-            joint,
-            number.attribute,
-            Sdf.ValueTypeNames.Double if ours else Sdf.ValueTypeNames.Float,
-            _checked(where, number.attribute, number.parameter, value) * number.factor,
-            f"{EFFECTS[group].meaning} [{unit}]"
-            if group in EFFECTS
-            else f"{name} = {value:g} {unit}",
-        )
-        if bounds:
-            ends = Gf.Vec2f(*_interval(where, number.interval, number.parameter, bounds))
-            meaning = f"95 % interval of {name} [{unit}]"
-            author(joint, number.interval, Sdf.ValueTypeNames.Float2, ends, meaning)
+        kind = Sdf.ValueTypeNames.Double if ours else Sdf.ValueTypeNames.Float
+        text = f"{name} = {value:g} {unit}"
+        if group in EFFECTS:
+            text = f"{EFFECTS[group].meaning} [{unit}]"
+        author(joint, number.attribute, kind, value * number.factor, text)
+        if ends:
+            text = f"95 % interval of {name} [{unit}]"
+            author(joint, number.interval, Sdf.ValueTypeNames.Float2, Gf.Vec2f(*ends), text)

@@ -9,11 +9,12 @@ pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
+import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull
@@ -58,7 +59,7 @@ ROUNDING_RAD = 1e-5
 
 
 def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) -> Usd.Stage:
-    """The stage of a hand with a kind of fingertip selected, and a layer on top, in the session layer.
+    """The stage of a hand with a kind of fingertip, and a layer on top, in the session layer.
 
     Pass the stage itself, not the path, to ``newton.ModelBuilder.add_usd``: neither is in the file.
 
@@ -93,7 +94,7 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
         if kinds:
             variants.SetVariantSelection(fingertip)
     if layer is not None:
-        add_layer(stage, Path(layer))
+        add_layer(stage, layer)
     return stage
 
 
@@ -109,7 +110,7 @@ def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None
         HandError: The file is not a hand, or the layer not one of it; names the prim and the
             attribute.
     """
-    return _Reader(Path(path), fingertip, None if layer is None else Path(layer)).read()
+    return _Reader(Path(path), fingertip, layer).read()
 
 
 def read_surfaces(hand: HandModel) -> dict[int, Surface]:
@@ -121,7 +122,12 @@ def read_surfaces(hand: HandModel) -> dict[int, Surface]:
     reader = _Reader(hand.path, hand.fingertip, hand.layer)
     surfaces: dict[int, Surface] = {}
     for link, name in enumerate(hand.link_names):
-        meshes = reader.drawn_meshes(reader.prim(name))
+        body = reader.prim(name)
+        meshes = []
+        for prim in Usd.PrimRange(body):
+            drawn = UsdGeom.Imageable(prim).ComputePurpose() != "guide"
+            if drawn and prim.IsA(UsdGeom.Mesh):
+                meshes.append(mesh_triangles(prim, reader.matrix(prim, body)))
         if meshes:
             vertices, faces = append_faces(*zip(*meshes, strict=True))
             surfaces[link] = Surface(vertices.astype(np.float32), faces.astype(np.int32))
@@ -130,38 +136,12 @@ def read_surfaces(hand: HandModel) -> dict[int, Surface]:
     return surfaces
 
 
-class _LinkRow(NamedTuple):
-    """What a hand has of one link; columns are fields of :class:`HandModel`."""
-
-    link_mass: float
-    link_com: np.ndarray
-    link_inertia: np.ndarray
-
-
-class _JointRow(NamedTuple):
-    """What a hand has of one joint, likewise."""
-
-    joint_parent: int
-    joint_child: int
-    joint_axis: np.ndarray
-    joint_parent_frame: np.ndarray
-    joint_child_frame: np.ndarray
-    lower: float
-    upper: float
-    kp: float
-    kd: float
-    effort: float
-    velocity_limit: float
-    armature: float
-    start: float
-    mimic: int
-    mimic_factor: float
-    mimic_offset: float
-
-
-def _columns(rows: Sequence[NamedTuple]) -> dict[str, Any]:
-    """Each field of rows as an array."""
-    return dict(zip(rows[0]._fields, map(np.array, zip(*rows, strict=True)), strict=True))
+def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Each entry of rows as an array; names are fields of :class:`HandModel`."""
+    columns = {}
+    for name in rows[0]:
+        columns[name] = np.array([row[name] for row in rows])
+    return columns
 
 
 class _Reader:
@@ -218,12 +198,12 @@ class _Reader:
             raise self.fail(
                 self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim"
             )
-        fingers = self._fingers()
         links = ["base"]
-        joints = []
+        fingers = []
+        joints: list[Usd.Prim] = []
         tips = []
-        for finger, joint_range in enumerate(fingers):
-            count = joint_range.stop - joint_range.start
+        for finger, count in enumerate(self._finger_lengths()):
+            fingers.append(slice(len(joints), len(joints) + count))
             links += [f"f{finger}_l{i + 1}" for i in range(count)]
             joints += [self.prim(f"f{finger}_j{i + 1}") for i in range(count)]
             tips.append(self.prim(f"{links[-1]}/f{finger}_tip"))
@@ -247,12 +227,7 @@ class _Reader:
             path=self.path,
             layer=self.layer,
             fingers=tuple(fingers),
-            mount=np.concatenate(
-                [
-                    self.vector(self.root, "vd:mount:position"),
-                    xyzw(self.value(self.root, "vd:mount:orientation")),
-                ]
-            ),
+            mount=self._pose(self.root, "vd:mount:position", "vd:mount:orientation"),
             palm=self._palm(),
             workspace=self._workspace(),
             link_names=tuple(links),
@@ -281,32 +256,27 @@ class _Reader:
                 remedy = "author the hand in metres and kilograms"
                 raise self.fail("/", f"'{name}' is {unit}", remedy)
 
-    def _fingers(self) -> list[slice]:
+    def _finger_lengths(self) -> list[int]:
         """Joints of each finger, by the names of its links, which have no gaps."""
         names = {child.GetName() for child in self.root.GetChildren()}
+        links = {name for name in names if re.fullmatch(r"f\d+_l\d+", name)}
+        number_of = Counter(name.partition("_")[0] for name in links)
+        lengths = [number_of[f"f{finger}"] for finger in range(len(number_of))]
         known = {"base"}
-        fingers: list[slice] = []
-        end = 0
-        while f"f{len(fingers)}_l1" in names:
-            finger = len(fingers)
-            count = 0
-            while f"f{finger}_l{count + 1}" in names:
-                count += 1
-                known |= {f"f{finger}_l{count}", f"f{finger}_j{count}"}
+        for finger, count in enumerate(lengths):
             if count > MAX_JOINTS:
                 what = f"finger {finger} has {count} joints"
                 raise self.fail(self.root, what, f"weld joints until it has {MAX_JOINTS} at most")
-            fingers.append(slice(end, end + count))
-            end += count
-        links = {name for name in names if re.fullmatch(r"f\d+_l\d+", name)}
-        if not fingers or links - known:
+            for i in range(count):
+                known |= {f"f{finger}_l{i + 1}", f"f{finger}_j{i + 1}"}
+        if not lengths or links - known:
             raise self.fail(
                 self.root,
                 f"has the links {', '.join(sorted(links)) or 'of no finger'}",
                 "name links f0_l1, f0_l2 and so on from the palm, f1_l1 ..., without gaps",
             )
         self._refuse_unknown(known)
-        return fingers
+        return lengths
 
     def _refuse_unknown(self, known: set[str]) -> None:
         """Refuse links and joints that the model would leave out."""
@@ -326,7 +296,7 @@ class _Reader:
 
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""
-        matrix = self._matrix(prim, ancestor)
+        matrix = self.matrix(prim, ancestor)
         # USD transforms row vectors.
         turn = (matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)).T
         shear = np.abs(turn @ turn.T - np.eye(3)).max()
@@ -336,19 +306,9 @@ class _Reader:
             )
         return np.concatenate([matrix[3, :3], Rotation.from_matrix(turn).as_quat()])
 
-    def _matrix(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
+    def matrix(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Transform of row vectors from a prim to an ancestor [4, 4]."""
         return np.array(self.cache.ComputeRelativeTransform(prim, ancestor)[0])
-
-    def drawn_meshes(self, body: Usd.Prim) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Vertices [V, 3] and triangles [T, 3] of what is drawn of a link, in its frame."""
-        drawn = []
-        for prim in Usd.PrimRange(body):
-            imageable = UsdGeom.Imageable(prim)
-            if prim.IsA(UsdGeom.Mesh) and imageable.ComputePurpose() != "guide":
-                surface = mesh_triangles(prim, self._matrix(prim, body))
-                drawn.append(surface)
-        return drawn
 
     def _palm(self) -> np.ndarray:
         """Where the palm looks, a unit vector [3]."""
@@ -370,7 +330,7 @@ class _Reader:
             size_m=(float(low), float(high)),
         )
 
-    def _link(self, body: Usd.Prim) -> _LinkRow:
+    def _link(self, body: Usd.Prim) -> dict[str, Any]:
         if not body.HasAPI(UsdPhysics.RigidBodyAPI):
             raise self.fail(body, "PhysicsRigidBodyAPI is missing", "apply it to every link")
         moments = self.vector(body, "physics:diagonalInertia")
@@ -382,15 +342,15 @@ class _Reader:
                 "three positive moments, none above the sum of two",
             )
         axes = Rotation.from_quat(xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
-        return _LinkRow(
-            self.number(body, "physics:mass", positive=True),
-            self.vector(body, "physics:centerOfMass"),
-            axes @ np.diag(moments) @ axes.T,
-        )
+        return {
+            "link_mass": self.number(body, "physics:mass", positive=True),
+            "link_com": self.vector(body, "physics:centerOfMass"),
+            "link_inertia": axes @ np.diag(moments) @ axes.T,
+        }
 
     def _joint(
         self, joint: Usd.Prim, joints: list[Usd.Prim], index: dict[Sdf.Path, int]
-    ) -> _JointRow:
+    ) -> dict[str, Any]:
         """A joint; its gains have to be positive only if it follows no other."""
         if not joint.IsA(UsdPhysics.RevoluteJoint):
             kind = joint.GetTypeName() or "typeless prim"
@@ -410,12 +370,12 @@ class _Reader:
         leader, factor, offset = self._mimic(joint, joints)
         drive = "drive:angular:physics"
         driven = leader < 0
-        return _JointRow(
+        return dict(
             joint_parent=parent,
             joint_child=child,
             joint_axis=np.eye(3)["XYZ".index(self.value(joint, "physics:axis"))],
-            joint_parent_frame=self._joint_frame(joint, 0),
-            joint_child_frame=self._joint_frame(joint, 1),
+            joint_parent_frame=self._pose(joint, "physics:localPos0", "physics:localRot0"),
+            joint_child_frame=self._pose(joint, "physics:localPos1", "physics:localRot1"),
             lower=low,
             upper=high,
             # Gains are authored per degree.
@@ -430,25 +390,22 @@ class _Reader:
             mimic_offset=offset,
         )
 
-    def _joint_frame(self, joint: Usd.Prim, side: int) -> np.ndarray:
-        """The frame of a joint in its parent (side 0) or child [7]."""
-        position = self.vector(joint, f"physics:localPos{side}")
-        return np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))])
+    def _pose(self, prim: Usd.Prim, position: str, rotation: str) -> np.ndarray:
+        """A pose in two attributes [7]."""
+        return np.concatenate([self.vector(prim, position), xyzw(self.value(prim, rotation))])
 
     def _joined_links(self, joint: Usd.Prim, index: dict[Sdf.Path, int]) -> tuple[int, int]:
         """Parent and child of a joint, which its name says."""
-        for side in (0, 1):
-            targets = _bodies(joint, side)
-            if len(targets) != 1 or targets[0] not in index:
-                what = f"'physics:body{side}' is {[str(target) for target in targets]}"
-                raise self.fail(joint, what, "point it at one link of the hand")
         finger, number = re.findall(r"\d+", joint.GetName())
         before = "base" if number == "1" else f"f{finger}_l{int(number) - 1}"
         parent = self.root.GetPath().AppendChild(before)
         child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
         if [*_bodies(joint, 0), *_bodies(joint, 1)] != [parent, child]:
-            what = "joins other links than its name says"
-            raise self.fail(joint, what, f"join {parent} and {child}")
+            raise self.fail(
+                joint,
+                "joins other links than its name says",
+                f"point 'physics:body0' at one link, {parent}, and 'physics:body1' at {child}",
+            )
         return index[parent], index[child]
 
     def _mimic(self, joint: Usd.Prim, joints: list[Usd.Prim]) -> tuple[int, float, float]:
@@ -562,7 +519,7 @@ class _Reader:
 
     def _shape(self, prim: Usd.Prim, body: Usd.Prim, link: int) -> CollisionShape:
         frame = self._relative(prim, body)
-        scale = np.linalg.norm(self._matrix(prim, body)[:3, :3], axis=1)
+        scale = np.linalg.norm(self.matrix(prim, body)[:3, :3], axis=1)
         usd_kind = str(prim.GetTypeName())
         kind = usd_kind.lower()
         vertices = np.zeros((0, 3))

@@ -95,15 +95,8 @@ def test_a_contact_sheet_says_all_there_is_to_say_and_within_its_edges(
         assert box.y0 >= 0.0 and box.y1 <= figure.bbox.height, text.get_text()
 
 
-def test_objects(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    assert run(monkeypatch, "objects", "--procedural", 3, "--seed", 4) == 0
-    assert "3 objects" in (said := capsys.readouterr().out) and "procedural-3-seed4" in said
+def test_the_name_of_a_procedural_set_makes_it():
     assert len(load_set("procedural-3-seed4")) == 3
-    assert run(monkeypatch, "objects", "--procedural", 0) == 1
-    assert run(monkeypatch, "objects", "--out", tmp_path / "symmetric") == 1
-    assert "my-symmetric" in capsys.readouterr().err and not (tmp_path / "symmetric").exists()
 
 
 def test_an_imported_cube_is_not_taken_for_the_built_in_one(
@@ -117,7 +110,7 @@ def test_an_imported_cube_is_not_taken_for_the_built_in_one(
     assert "built-in" in error and f"--out {out}" in error and not (cache / "objects").exists()
     assert run(monkeypatch, "import", mesh, "--out", out, "--units", "m", "--mass", "0.2") == 0
     text = capsys.readouterr().out
-    assert "longest side 0.12 m (0 of 1 scaled), mass 0.2 kg" in text
+    assert "longest side 0.12 to 0.12 m (0 of 1 scaled), mass 0.2 to 0.2 kg" in text
     assert load_set("my-cube")[0].longest_side == pytest.approx(0.12)
 
 
@@ -132,11 +125,6 @@ def test_errors_are_one_line_and_status_1(
     assert "dclaw3" in capsys.readouterr().err
 
 
-def test_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 0
-    path = Path(capsys.readouterr().out.strip())
-    assert path.parent == tmp_path / "hands" and load_hand(str(path)).num_joints == 9
-    assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 0
-    path.write_text(mine := path.read_text().replace("0.8", "0.9"))
-    assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 1
-    assert "another hand" in capsys.readouterr().err and path.read_text() == mine
+def test_hand(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "hand", "dclaw3") == 0
+    assert load_hand(capsys.readouterr().out.strip()).num_joints == 9

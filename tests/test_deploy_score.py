@@ -15,7 +15,7 @@ from vd.deploy.loop.score import (
     score,
     stop_errors,
 )
-from vd.evaluate.statistics import rotation_angle
+from vd.geometry.quaternions import rotation_distance
 from vd.logs.hand_log import read_log
 from vd.logs.log_format import JOINT_CHANNELS, STEP_COLUMNS
 
@@ -139,14 +139,14 @@ def test_a_track_is_turned_into_the_hands_world(run, tmp_path):
     assert not mocap.tracked[-1], "empty cells"
     np.testing.assert_allclose(mocap.pose[0, :3], frame.apply([0.0, 0.0, 0.1]), atol=1e-6)
     turn = (frame * Rotation.from_quat(run.turn[0])).as_quat()
-    assert rotation_angle(mocap.pose[0, 3:], turn) < 1e-5
+    assert rotation_distance(mocap.pose[0, 3:], turn) < 1e-5
 
 
 def test_the_markers_frame_on_the_object_is_taken_out(run, tmp_path):
     path = run.export(tmp_path / "m.csv")
     mocap = in_world(read_mocap(path), world=(0, 0, 0, 1), marker=tuple(QUARTER.as_quat()))
     expected = (Rotation.from_quat(run.turn[0]) * QUARTER).as_quat()
-    assert rotation_angle(mocap.pose[0, 3:], expected) < 1e-5
+    assert rotation_distance(mocap.pose[0, 3:], expected) < 1e-5
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE
 from vd.evaluate.page import terminal_text, write_page
 from vd.evaluate.result import Agent, Result, judge
 from vd.evaluate.rollout import draw_turns
-from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.trace import record
+from vd.geometry.quaternions import rotation_distance
 from vd.policy.stopping import StoppingRule
 
 OBJECTS = (FakeObject("a"), FakeObject("b"))
@@ -99,7 +99,9 @@ def test_goals_follow_one_another_once_the_table_is_gone():
         "and others as they come"
     )
     angle = Rotation.from_quat(turns[:, :, 0].reshape(-1, 4)).magnitude().reshape(2, 4)
-    np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), angle, atol=1e-5)
+    np.testing.assert_allclose(
+        rotation_distance(trace.start_quat, trace.goal_quat), angle, atol=1e-5
+    )
     row = row_of(trace, air_goals=True)
     steps = np.reshape([e.steps for e in row.episodes], (2, 4))
     np.testing.assert_array_equal(steps, np.maximum(1, np.floor((angle - 0.4) / STEP_RAD) + 1))
@@ -134,7 +136,7 @@ def test_what_is_lost_before_or_after_the_first_goal_was_drawn_is_told_apart(tmp
 def test_a_stop_away_from_the_goal_ends_the_row():
     trace, env, _ = flown(blind_rad=0.5)
     assert trace.given.all() and len(env.given) == 1 and not trace.fell.any()
-    far = rotation_angle(trace.start_quat, trace.goal_quat) > 1.0
+    far = rotation_distance(trace.start_quat, trace.goal_quat) > 1.0
     row = row_of(trace, air_goals=True)
     assert far.any() and all(e.stopped for e in row.episodes) and not trace.reached[far].any()
     assert row.overall.outcomes["orientation error"].value >= far.mean()
@@ -154,7 +156,9 @@ def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_pa
     assert way[0].action_norm > env.num_actions, "no action is too much"
     trace = record(env, Seeker(env), EPISODES, series, ways=[way], turns=turns, **given)
     assert not env.tables, "the table is left alone"
-    np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), 1.05, atol=1e-5)
+    np.testing.assert_allclose(
+        rotation_distance(trace.start_quat, trace.goal_quat), 1.05, atol=1e-5
+    )
     reached = trace.reached.tolist()
     assert (
         reached[0][0] == 0

@@ -15,8 +15,9 @@ from vd.evaluate.cfg import parse_groups
 from vd.evaluate.goals import GoalSchedule
 from vd.evaluate.result import OUTCOMES, SUCCESS, Agent, Protocol, Result, judge
 from vd.evaluate.rollout import draw_starts_and_goals
-from vd.evaluate.statistics import TOLERANCES_RAD, rotation_angle
+from vd.evaluate.statistics import TOLERANCES_RAD
 from vd.evaluate.trace import NEVER_RAD, record
+from vd.geometry.quaternions import rotation_distance
 from vd.policy.stopping import StoppingRule
 
 CUBE = Rotation.create_group("O").as_quat()
@@ -40,7 +41,7 @@ class Turner:
     def act(self, observation):
         """The same action in all environments."""
         if hasattr(self, "predicted"):
-            true = rotation_angle(observation[:, :4].numpy(), observation[:, 4:8].numpy())
+            true = rotation_distance(observation[:, :4].numpy(), observation[:, 4:8].numpy())
             self.predicted[:] = torch.as_tensor(true + self.offset)
         action = torch.zeros((self.env.num_envs, self.env.num_actions))
         action[:, 2] = STEP_RAD * 12.0 * (int(self.env.step_count.numpy()[0]) < self.until)
@@ -286,7 +287,7 @@ def test_every_start_and_goal_is_run_once_whatever_the_number_of_environments(en
     )
     errors = [e.error_rad for e in episodes]
     np.testing.assert_allclose(errors, [e.start_error_rad for e in episodes], atol=2e-3)
-    plain = rotation_angle(told["starts"], told["goals"]).ravel()
+    plain = rotation_distance(told["starts"], told["goals"]).ravel()
     np.testing.assert_allclose([e.exact_error_rad for e in episodes], plain, atol=1e-5)
     assert max(errors[4:8]) < 1.1 < plain[4:8].max(), "of a cube up to symmetry"
     env.world_object[:] = 0
@@ -310,9 +311,9 @@ def test_what_the_environment_draws_is_recorded_and_does_not_depend_on_the_polic
         np.array([getattr(e, name) for e in first]) for name in ("start_quat", "goal_quat")
     )
     np.testing.assert_allclose(
-        [e.error_rad for e in first], rotation_angle(starts, goals), atol=2e-3
+        [e.error_rad for e in first], rotation_distance(starts, goals), atol=2e-3
     )
-    apart = rotation_angle(starts[:, None], starts[None]) + 4.0 * np.eye(len(starts))
+    apart = rotation_distance(starts[:, None], starts[None]) + 4.0 * np.eye(len(starts))
     assert apart.min() > 1e-3, "a start was used twice"
 
 
@@ -321,10 +322,10 @@ def test_starts_and_goals_depend_on_name_and_seed_alone_and_goals_are_uniform_wi
     for same, other in zip((start, goal), draw_starts_and_goals("shoe", 50, seed=3), strict=True):
         np.testing.assert_array_equal(same, other)
     for name, seed in (("shoe", 4), ("boot", 3)):
-        assert rotation_angle(start, draw_starts_and_goals(name, 50, seed=seed)[0]).min() > 0.0
-    angle = rotation_angle(*draw_starts_and_goals("x", 20_000, seed=0))
+        assert rotation_distance(start, draw_starts_and_goals(name, 50, seed=seed)[0]).min() > 0.0
+    angle = rotation_distance(*draw_starts_and_goals("x", 20_000, seed=0))
     assert angle.mean() == pytest.approx(np.pi / 2 + 2 / np.pi, abs=0.02)
-    near = rotation_angle(*draw_starts_and_goals("x", 20_000, seed=0, max_goal_angle=1.0))
+    near = rotation_distance(*draw_starts_and_goals("x", 20_000, seed=0, max_goal_angle=1.0))
     assert near.max() <= 1.0
     # Of uniform rotations within 1 rad, the share within 0.8 rad:
     assert (near <= 0.8).mean() == pytest.approx((0.8 - np.sin(0.8)) / (1 - np.sin(1.0)), abs=0.015)

@@ -114,10 +114,9 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-gap": ["run", "recording", "--out", taken],
         "vd-deploy": ["record", "--twin", "--hand", "dclaw3", "--out", taken],
         "vd-deploy ": ["--twin", "--hand", "dclaw3", "--log", taken],
-        "vd-assets": ["objects", "--procedural", "1", "--out", taken],
+        "vd-assets": ["hand", "import", "hand.urdf", "--out", taken],
         "vd-assets ": ["import", "mesh.obj", "--out", taken],
-        "vd-assets  ": ["hand", "dclaw3", "--out", taken],
-        "vd-assets   ": ["show", "cube", "--out", f"{taken}/x.png"],
+        "vd-assets  ": ["show", "cube", "--out", f"{taken}/x.png"],
         "vd-bench": ["sim", "--json", f"{taken}/x.json"],
     }
 

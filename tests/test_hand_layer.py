@@ -188,28 +188,3 @@ def test_wrong_layers_name_file_prim_and_attribute(tmp_path, text, message):
     with pytest.raises(HandError, match=re.escape(message)) as error:
         read(path)
     assert "bad.usda" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("baseline", "effects", "message"),
-    [
-        ({"f9_j1": {"kp": 1.0}}, {}, "dclaw3 has no joint 'f9_j1'; it has f0_j1"),
-        ({"f0_j1": {"stiffness": 1.0}}, {}, "baseline has no parameter 'stiffness'; one of kp"),
-        ({}, {"f0_j1": {"wear": {"x": 1.0}}}, "no effect is called 'wear'"),
-        (
-            {},
-            {"f0_j1": {"backlash": {"width_rad": 1.0, "d": 1.0}}},
-            "backlash has no parameter 'd'",
-        ),
-        (
-            {},
-            {"f0_j1": {"elastic_transmission": {"k_nm_rad": 1.0}}},
-            "lacks 'vd:elastic_transmission:j_kgm2'",
-        ),
-    ],
-)
-def test_wrong_numbers_are_not_written(hand, tmp_path, baseline, effects, message):
-    path = tmp_path / "identified.usda"
-    with pytest.raises(HandError, match=re.escape(message)):
-        write(path, hand, baseline, effects)
-    assert not path.exists()

@@ -269,7 +269,7 @@ def test_debris_does_not_set_the_scale(tmp_path: Path):
     crumb = trimesh.creation.box((0.008, 0.008, 0.008)).apply_translation([0.0, 2.0, 0.0])
     for debris in (speck, crumb):
         repaired = repair_mesh(trimesh.util.concatenate([l_shape(), debris]))
-        assert np.ptp(repaired.vertices, axis=0) == pytest.approx([0.12, 0.08, 0.03])
+        assert np.ptp(repaired.surface.vertices, axis=0) == pytest.approx([0.12, 0.08, 0.03])
         assert body_of(repaired).solid.volume == pytest.approx(L_VOLUME)
         assert len(repaired.warnings) == 1
     # Inside of the object's box it changes nothing that matters.
@@ -378,7 +378,7 @@ def test_what_is_left_out_and_long_is_a_warning():
         [[0.0, 0.0, 0.03], [0.01, 0.0, 0.03], [0.0, 0.001, 0.03]], [[0, 1, 2]], process=False
     )
     repaired = repair_mesh(trimesh.util.concatenate([body, scrap]))
-    assert repaired.notes[0].startswith("1 convex piece") and len(repaired.vertices) == 8
+    assert repaired.notes[0].startswith("1 convex piece") and len(repaired.surface.vertices) == 8
     assert repaired.warnings == ("removed 1 stray piece of surface, up to 8 % as long as it is",)
 
 
@@ -399,22 +399,22 @@ def crashing(*_: object) -> None:
     os._exit(11)
 
 
-def waiting(vertices: np.ndarray, *_: object) -> list[np.ndarray]:
+def waiting(surface: trimesh.Trimesh, *_: object) -> list[np.ndarray]:
     """Stands for CoACD on a machine with other things to do: 1.5 s for no work."""
     time.sleep(1.5)
-    return [vertices]
+    return [surface.vertices]
 
 
 def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest.MonkeyPatch):
     mesh = l_shape()
     limits = replace(FAST, time_limit=1.0)
     monkeypatch.setattr(d, "_coacd_parts", stuck)
-    result = d.decompose(mesh.vertices, mesh.faces, limits)
+    result = d.decompose(mesh, limits)
     assert result.method == "one hull" and len(result.hulls) == 1
     assert "no result after 1 s of processor time" in result.fallback[0]
     assert hull_depth(result.hulls[0], mesh.vertices).max() < 1e-9
     monkeypatch.setattr(d, "_coacd_parts", waiting)
-    assert d.decompose(mesh.vertices, mesh.faces, limits).fallback == ()
+    assert d.decompose(mesh, limits).fallback == ()
 
 
 def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

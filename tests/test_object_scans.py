@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points
+from vd.assets_usd.objects.geometry import Surface, mesh_volume, random_surface_points
 from vd.assets_usd.objects.model import SURFACE_POINTS
 from vd.assets_usd.objects.scans import surface_of_scan
 from vd.assets_usd.objects.sets import load_set
@@ -24,7 +24,7 @@ def ball(count, seed=0):
 
 def off(points, surface):
     """Distances of points from a mesh [m], to a millimetre."""
-    samples = random_surface_points(*surface, 20_000, np.random.default_rng(5))
+    samples = random_surface_points(surface, 20_000, np.random.default_rng(5))
     return cKDTree(samples).query(points)[0]
 
 
@@ -68,9 +68,9 @@ def test_an_object_is_known_by_its_scan(device):
     ]
     for item, found in zip(items, known, strict=True):
         assert found.name == item.name and found.surface_points.shape == (SURFACE_POINTS, 3)
-        assert off(found.surface_points, (found.vertices, found.faces)).max() < 1.5e-3
+        assert off(found.surface_points, Surface(found.vertices, found.faces)).max() < 1.5e-3
         # Where the scanner has been: nearer than the noise (4 mm along each axis) at most points.
-        away = off(found.surface_points, (item.vertices, item.faces))
+        away = off(found.surface_points, Surface(item.vertices, item.faces))
         assert np.median(away) < 0.003
     of = {"world_object": np.arange(2), "world_scale": np.ones(2), "library": library_on(device)}
     found = Registration(known, **of, camera=None, device=device)

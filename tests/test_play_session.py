@@ -6,7 +6,7 @@ import pytest
 import torch
 from fake_env import FakeEnv, FakeObject
 
-from vd.evaluate.statistics import rotation_angle
+from vd.geometry.quaternions import rotation_distance
 from vd.play.cli import spread
 from vd.play.session import Session
 from vd.play.video import Watcher, act
@@ -36,10 +36,10 @@ def test_new_goal_changes_the_goal_alone():
     before = session.snapshot
     after = session.new_goal()
     np.testing.assert_allclose(after.joint_q, before.joint_q)
-    assert rotation_angle(after.goal_quat, before.goal_quat) > 1e-3
+    assert rotation_distance(after.goal_quat, before.goal_quat) > 1e-3
     assert after.error_rad <= 0.5 + 1e-3
     assert after.error_rad == pytest.approx(
-        rotation_angle(after.joint_q[-4:], after.goal_quat), abs=1e-3
+        rotation_distance(after.joint_q[-4:], after.goal_quat), abs=1e-3
     )
 
 
@@ -50,7 +50,7 @@ def test_reset_shows_the_error_of_the_new_start_and_keeps_counts():
     shot = session.reset()
     assert not shot.success and shot.goals == 1
     assert shot.error_rad == pytest.approx(
-        rotation_angle(shot.joint_q[-4:], shot.goal_quat), abs=1e-3
+        rotation_distance(shot.joint_q[-4:], shot.goal_quat), abs=1e-3
     )
 
 

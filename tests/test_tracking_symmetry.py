@@ -20,7 +20,7 @@ NEAR_RAD = 0.05
 def shape(mesh: trimesh.Trimesh) -> ObjectModel:
     """An object with the shape of a mesh, which declares no symmetry."""
     vertices, faces = np.float32(mesh.vertices), np.int32(mesh.faces)
-    points = np.float32(surface_points(mesh.vertices, faces, 500, outside=[]))
+    points = np.float32(surface_points(mesh, 500, outside=[]))
     cube = load_set(["cube"])[0]
     return replace(cube, vertices=vertices, faces=faces, surface_points=points, symmetry=IDENTITY)
 

@@ -26,6 +26,7 @@ from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
 from vd.assets_usd.hand_import.tree import Tree, shape_box
 from vd.assets_usd.objects.geometry import (
+    Surface,
     convex_hull,
     principal_axes,
     simplify_hull,
@@ -207,7 +208,7 @@ class Author:
         points.CreatePurposeAttr(UsdGeom.Tokens.guide)
         points.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
         with Usd.EditContext(self.stage, self.meshes):
-            points.CreatePointsAttr(surface_points(vertices, faces, POINTS))
+            points.CreatePointsAttr(surface_points(Surface(vertices, faces), POINTS))
 
     def _joint(self, number: int, joint: Joint) -> None:
         path = f"{self.root}/{self.joints[number]}"

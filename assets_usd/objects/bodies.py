@@ -11,6 +11,7 @@ from scipy.stats import qmc
 from vd.assets_usd.objects.geometry import (
     Hull,
     Solid,
+    Surface,
     distances,
     inside,
     joined,
@@ -75,40 +76,37 @@ def body_of(mesh: RepairedMesh) -> Body:
 
     A surface that has no inside is a sheet: the solid is what is near to it.
     """
-    vertices = mesh.vertices
-    faces = mesh.faces
-    within: Inside = partial(inside, vertices, faces)
+    surface = mesh.surface
+    within: Inside = partial(inside, surface)
     method = "winding numbers"
     warnings: tuple[str, ...] = ()
     if mesh.watertight:
-        solid = solid_of_mesh(vertices, faces)
+        solid = solid_of_mesh(surface)
         method = "exact mesh volume"
     else:
-        if not mesh.closed and _open_share(vertices, faces) > OPEN_SHARE:
-            thickness = SHEET * float(np.ptp(vertices, axis=0).max())
-            within = partial(_near, vertices, faces, thickness / 2.0)
+        if not mesh.closed and _open_share(surface) > OPEN_SHARE:
+            thickness = SHEET * float(np.ptp(surface.vertices, axis=0).max())
+            within = partial(_near, surface, thickness / 2.0)
             method = "sheet"
             warnings = (
                 f"open: the surface encloses nothing, and is taken as a sheet "
                 f"{1e3 * thickness:.1f} mm thick, empty inside; close it, or give it thickness",
             )
-        solid = solid_by_points(vertices, within)
+        solid = solid_by_points(surface.vertices, within)
     volume = solid.volume
-    if len(mesh.cavity_faces):
-        solid = joined([solid, solid_of_mesh(mesh.cavity_vertices, mesh.cavity_faces)])
+    if len(mesh.cavities.faces):
+        solid = joined([solid, solid_of_mesh(mesh.cavities)])
     return Body(within, volume, solid, method, warnings)
 
 
-def _near(
-    vertices: np.ndarray, faces: np.ndarray, distance: float, points: np.ndarray
-) -> np.ndarray:
-    return distances(vertices, faces, points) <= distance
+def _near(surface: Surface, distance: float, points: np.ndarray) -> np.ndarray:
+    return distances(surface, points) <= distance
 
 
-def _open_share(vertices: np.ndarray, faces: np.ndarray) -> float:
+def _open_share(surface: Surface) -> float:
     """Volume in which it is unclear what is inside, as a share of what is inside."""
-    points, _ = _points_around(vertices)
-    low, high = (inside(vertices, faces, points, level) for level in OPEN_LEVELS)
+    points, _ = _points_around(surface.vertices)
+    low, high = (inside(surface, points, level) for level in OPEN_LEVELS)
     return float((low & ~high).sum() / max(high.sum(), 1))
 
 
@@ -142,7 +140,10 @@ def solid_by_points(vertices: np.ndarray, within: Inside, points_along: int = VO
 
 
 def _points_around(vertices: np.ndarray) -> tuple[np.ndarray, float]:
-    """Points [SAMPLES, 3] that fill a box around vertices along their principal axes, and its volume."""
+    """Points [SAMPLES, 3] that fill a box around vertices, and its volume.
+
+    The box lies along their principal axes.
+    """
     axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     along = vertices @ axes.T
     side = (1.0 + 2.0 * MARGIN) * np.ptp(along, axis=0)
@@ -171,6 +172,6 @@ def error_of_parts(body: Body, vertices: np.ndarray) -> Callable[[Sequence[Hull]
 
 def cavity_share(mesh: RepairedMesh, body: Body) -> float:
     """Volume of a mesh's cavities as a share of its solid's."""
-    if not len(mesh.cavity_faces):
+    if not len(mesh.cavities.faces):
         return 0.0
-    return -mesh_volume(mesh.cavity_vertices, mesh.cavity_faces) / body.solid.volume
+    return -mesh_volume(*mesh.cavities) / body.solid.volume

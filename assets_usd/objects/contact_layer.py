@@ -103,7 +103,7 @@ interval.
 
 
 def author_contact(prim: Any, identified: Identified) -> None:
-    """Author what was identified on the spec of an object's root prim, USD's own attributes apart."""
+    """Author what was identified on an object's root prim, USD's own attributes apart."""
     from pxr import Sdf
 
     from vd.assets_usd.hand_layer import author
@@ -146,7 +146,7 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
                 f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} "
                 f"high"
             )
-        identified[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
+        identified[name] = tuple(tuple(part.tolist()) for part in (value, low, high))
     return identified
 
 

@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
+    Surface,
     convex_hull,
     hull_volume,
     mesh_volume,
@@ -76,15 +77,13 @@ class Decomposition:
     error: float = 0.0
 
 
-def _coacd_parts(
-    vertices: np.ndarray, faces: np.ndarray, settings: ImportSettings, max_vertices: int
-) -> list[np.ndarray]:
+def _coacd_parts(surface: Surface, settings: ImportSettings, max_vertices: int) -> list[np.ndarray]:
     """Vertices of CoACD's parts."""
     import coacd
 
     coacd.set_log_level("off")
     parts = coacd.run_coacd(
-        coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
+        coacd.Mesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int32)),
         threshold=settings.threshold,
         max_convex_hull=settings.max_hulls,
         preprocess_mode="auto",
@@ -143,32 +142,30 @@ def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ..
 
 
 def decompose(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    settings: ImportSettings,
-    max_vertices: int = HULL_VERTICES,
+    surface: Surface, settings: ImportSettings, max_vertices: int = HULL_VERTICES
 ) -> Decomposition:
     """Split a mesh into convex parts: by CoACD in a child process, or its convex hull alone.
 
     Args:
-        vertices: [V, 3], m.
-        faces: [T, 3].
+        surface: The mesh [m].
         settings: Its limits.
         max_vertices: Most vertices of a part.
     """
-    parts = _parts_or_reason(settings.time_limit, vertices, faces, settings, max_vertices)
+    parts = _parts_or_reason(settings.time_limit, surface, settings, max_vertices)
     hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
     why = parts if isinstance(parts, str) else "it gave only slivers"
     if hulls:
         return Decomposition(hulls, "coacd")
-    hull = simplify_hull(convex_hull(vertices), max_vertices)
+    hull = simplify_hull(convex_hull(surface.vertices), max_vertices)
     return Decomposition(
         (hull,), "one hull", (f"coacd failed: {why}", "one convex hull stands for the whole mesh")
     )
 
 
 def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
-    """Parts [V, 3] merged to at most ``most``, each time the two whose common hull adds the least volume.
+    """Parts [V, 3] merged to at most ``most``.
+
+    Each time the two are merged whose common hull adds the least volume.
 
     CoACD merges by the depth of concavities, and fills thin walls and rings more than it has to.
     """
@@ -196,8 +193,7 @@ def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
 
 
 def best_decomposition(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    surface: Surface,
     settings: ImportSettings,
     error_of: Callable[[Sequence[Hull]], float],
 ) -> Decomposition:
@@ -206,19 +202,18 @@ def best_decomposition(
     Else parts merged from a fine decomposition, as many as are needed.
 
     Args:
-        vertices: [V, 3], m.
-        faces: [T, 3].
+        surface: The mesh [m].
         settings: Limits; its threshold is that of the first decomposition.
         error_of: Error of parts.
     """
     few = min(USUAL_HULLS, settings.max_hulls)
-    first = decompose(vertices, faces, replace(settings, max_hulls=few))
+    first = decompose(surface, replace(settings, max_hulls=few))
     first = replace(first, error=error_of(first.hulls))
     if first.error <= GOOD_ERROR or first.fallback:
         return first
     threshold = max(FINE_THRESHOLD * settings.threshold, LEAST_THRESHOLD)
     limits = replace(settings, max_hulls=FINE_HULLS, threshold=threshold)
-    fine = decompose(vertices, faces, limits, 2 * HULL_VERTICES)
+    fine = decompose(surface, limits, 2 * HULL_VERTICES)
     if fine.fallback:
         return replace(first, fallback=("no finer parts", *fine.fallback))
     candidates = [first]

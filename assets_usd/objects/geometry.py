@@ -66,14 +66,14 @@ class Solid(NamedTuple):
     inertia: np.ndarray
 
 
-def _corners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _corners(surface: Surface) -> np.ndarray:
     """First, second and third corners of triangles, [3, T, 3] float64."""
-    return np.asarray(vertices, dtype=np.float64)[faces.T]
+    return np.asarray(surface.vertices, dtype=np.float64)[surface.faces.T]
 
 
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _normals(surface: Surface) -> np.ndarray:
     """Normals of triangles [T, 3], as long as twice their areas."""
-    a, b, c = _corners(vertices, faces)
+    a, b, c = _corners(surface)
     return np.cross(b - a, c - a)
 
 
@@ -93,7 +93,7 @@ def convex_hull(points: np.ndarray) -> Hull:
         hull = ConvexHull(points)
     except QhullError as error:
         raise ValueError("the points lie in one plane") from error
-    normal = _normals(points, hull.simplices)
+    normal = _normals(Surface(points, hull.simplices))
     inward = np.einsum("ij,ij->i", normal, hull.equations[:, :3]) < 0.0
     simplices = hull.simplices.copy()
     simplices[inward] = simplices[inward][:, ::-1]
@@ -111,11 +111,11 @@ def hull_volume(points: np.ndarray) -> float:
 
 def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
     """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
-    normal = _normals(*hull)
+    normal = _normals(hull)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-12 * length.max()
     normal = normal[keep] / length[keep, None]
-    offset = np.einsum("ij,ij->i", normal, _corners(*hull)[0, keep])
+    offset = np.einsum("ij,ij->i", normal, _corners(hull)[0, keep])
     points = np.asarray(points, dtype=np.float64)
     chunks = np.array_split(points, 1 + len(points) * len(offset) // MOST_DISTANCES)
     return np.concatenate([(chunk @ normal.T - offset).max(axis=1) for chunk in chunks])
@@ -131,20 +131,21 @@ def union_depth(hulls: Sequence[Hull], points: np.ndarray) -> np.ndarray:
 
 def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Signed volume enclosed by a closed mesh, m^3 (divergence theorem)."""
-    a, b, c = _corners(vertices, faces)
+    a, b, c = _corners(Surface(vertices, faces))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
 class _QueriedMesh:
     """A mesh on the processor, of unit length, that Warp's kernels ask."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, winding: bool = False):
+    def __init__(self, surface: Surface, *, winding: bool = False):
         import warp as wp
 
-        self.low = vertices.min(axis=0)
-        self.size = float(np.ptp(vertices, axis=0).max())
-        indices = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-        self.mesh = wp.Mesh(self.placed(vertices), indices, support_winding_number=winding)
+        self.low = surface.vertices.min(axis=0)
+        self.size = float(np.ptp(surface.vertices, axis=0).max())
+        indices = wp.array(surface.faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
+        corners = self.placed(surface.vertices)
+        self.mesh = wp.Mesh(corners, indices, support_winding_number=winding)
 
     def placed(self, points: np.ndarray) -> Any:
         """Points [.., 3] in its frame, as an array of vectors."""
@@ -154,28 +155,26 @@ class _QueriedMesh:
         return wp.array(scaled.astype(np.float32), dtype=wp.vec3, device="cpu")
 
 
-def inside(
-    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5
-) -> np.ndarray:
-    """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
+def inside(surface: Surface, points: np.ndarray, level: float = 0.5) -> np.ndarray:
+    """Whether the winding number of a mesh exceeds ``level`` at points [n, 3], bool [n]."""
     import warp as wp
 
     from vd.kernels.sensor.winding import inside_kernel
 
-    queried = _QueriedMesh(vertices, faces, winding=True)
+    queried = _QueriedMesh(surface, winding=True)
     result = wp.zeros(len(points), dtype=wp.bool, device="cpu")
     inputs = [queried.mesh.id, level, queried.placed(points)]
     wp.launch(inside_kernel, result.shape, inputs, [result], device="cpu")
     return np.asarray(result.numpy(), dtype=bool)
 
 
-def distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distances of points [n, 3] from a mesh [V, 3], [T, 3] at most its length away, [n]."""
+def distances(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """Distances of points [n, 3] from a mesh at most its length away, [n]."""
     import warp as wp
 
     from vd.kernels.sensor.shape_grids import off_mesh_kernel
 
-    queried = _QueriedMesh(vertices, faces)
+    queried = _QueriedMesh(surface)
     result = wp.zeros((1, len(points)), dtype=float, device="cpu")
     number = wp.array([queried.mesh.id], dtype=wp.uint64, device="cpu")
     inputs = [queried.placed(points[None]), number]
@@ -207,12 +206,15 @@ def simplify_hull(hull: Hull, max_vertices: int) -> Hull:
         chosen.append(farthest)
         kept = convex_hull(points[chosen])
     growth = np.cbrt(mesh_volume(*hull) / mesh_volume(*kept))
-    centroid = solid_of_mesh(*kept).centroid
+    centroid = solid_of_mesh(kept).centroid
     return Hull(centroid + (kept.vertices - centroid) * growth, kept.faces)
 
 
 def _tetrahedron(points: np.ndarray) -> list[int]:
-    """Four of points [n, 3]: each is the farthest from their mean, the point, line or plane before."""
+    """Four of points [n, 3].
+
+    Each is the farthest from their mean, or the point, line or plane before.
+    """
     first = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
     away = points - points[first]
     second = int(np.argmax(np.linalg.norm(away, axis=1)))
@@ -223,14 +225,14 @@ def _tetrahedron(points: np.ndarray) -> list[int]:
     return [first, second, third, fourth]
 
 
-def solid_of_mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
+def solid_of_mesh(surface: Surface) -> Solid:
     """Exact mass properties of the solid bounded by a closed, outward mesh (density 1)."""
     from trimesh.triangles import mass_properties
 
-    vertices = np.asarray(vertices, dtype=np.float64)
+    vertices = np.asarray(surface.vertices, dtype=np.float64)
     reference = vertices.mean(axis=0)
-    found = mass_properties((vertices - reference)[faces])
-    return Solid(float(found.volume), reference + found.center_mass, found.inertia)
+    mass = mass_properties((vertices - reference)[surface.faces])
+    return Solid(float(mass.volume), reference + mass.center_mass, mass.inertia)
 
 
 def joined(solids: Sequence[Solid]) -> Solid:
@@ -262,16 +264,14 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return moments, Rotation.from_matrix(axes).as_quat(canonical=True)
 
 
-def triangle_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def triangle_areas(surface: Surface) -> np.ndarray:
     """Area of each triangle [T], m^2."""
-    return np.linalg.norm(_normals(vertices, faces), axis=1) / 2.0
+    return np.linalg.norm(_normals(surface), axis=1) / 2.0
 
 
-def random_surface_points(
-    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
+def random_surface_points(surface: Surface, count: int, rng: np.random.Generator) -> np.ndarray:
     """Uniform random points on a surface, [count, 3]."""
-    area = np.cumsum(triangle_areas(vertices, faces))
+    area = np.cumsum(triangle_areas(surface))
     if not len(area) or area[-1] <= 0.0:
         raise ValueError("the surface has no area")
     index = np.searchsorted(area, rng.uniform(0.0, area[-1], count))
@@ -279,24 +279,17 @@ def random_surface_points(
     flip = u + v > 1.0
     u = np.where(flip, 1.0 - u, u)
     v = np.where(flip, 1.0 - v, v)
-    a, b, c = _corners(vertices, faces[np.minimum(index, len(area) - 1)])
+    a, b, c = _corners(surface)[:, np.minimum(index, len(area) - 1)]
     return a + u * (b - a) + v * (c - a)
 
 
-def surface_points(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    count: int,
-    *,
-    outside: Sequence[Hull] = (),
-) -> np.ndarray:
+def surface_points(surface: Surface, count: int, *, outside: Sequence[Hull] = ()) -> np.ndarray:
     """Evenly spread points on a surface, by farthest-point sampling of random candidates.
 
     Equal input gives equal points.
 
     Args:
-        vertices: [V, 3].
-        faces: [T, 3].
+        surface: The surface.
         count: Number of points.
         outside: Points inside any of these hulls are left out (parts that overlap).
 
@@ -304,10 +297,10 @@ def surface_points(
         [count, 3] float64.
     """
     rng = np.random.default_rng(0)
-    tolerance = 1e-6 * float(np.ptp(vertices, axis=0).max())
+    tolerance = 1e-6 * float(np.ptp(surface.vertices, axis=0).max())
     candidates = np.zeros((0, 3))
     while len(candidates) < count:
-        points = random_surface_points(vertices, faces, CANDIDATES_PER_POINT * count, rng)
+        points = random_surface_points(surface, CANDIDATES_PER_POINT * count, rng)
         outer = points[union_depth(outside, points) > -tolerance]
         candidates = np.concatenate([candidates, outer])
     return candidates[spread(candidates, count)]
@@ -326,46 +319,30 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-def _tidied(faces: np.ndarray, *, closed: bool) -> np.ndarray:
-    """Triangles [T, 3], each once: a thin wall becomes a sheet.
-
-    ``closed``: of those with equal corners, an even number goes, so that what is closed stays so.
-    """
-    from trimesh.grouping import unique_rows
-
-    first, group = unique_rows(np.sort(faces, axis=1))
-    if closed:
-        first = first[np.bincount(group) % 2 == 1]
-    return np.asarray(faces[np.sort(first)])
-
-
-def cluster_vertices(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    max_faces: int,
-    *,
-    closed: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
+def cluster_vertices(surface: Surface, max_faces: int, *, closed: bool = False) -> Surface:
     """Coarsen a mesh to at most ``max_faces`` triangles by merging the vertices of a grid cell.
 
     The finest grid that meets the limit is found by bisection. A cell's vertex minimises the
     squared distance to the planes of the triangles around it (quadric error), which keeps edges
-    sharp; the bounding box is kept. A thin wall becomes a sheet, or is gone where what is ``closed``
-    has to stay so.
+    sharp; the bounding box is kept. A thin wall becomes a sheet, or is gone where what is
+    ``closed`` has to stay so.
     """
+    vertices = surface.vertices
+    faces = surface.faces
     if len(faces) <= max_faces:
-        return vertices, faces
+        return Surface(vertices, faces)
     if len(vertices) > len(faces):  # corners of their own: those at one place become one
-        cell, faces = _clustered(vertices, faces, FINEST_GRID, closed=closed)
+        cell, faces = _clustered(surface, FINEST_GRID, closed=closed)
         kept = np.zeros(cell.max() + 1, dtype=int)
         kept[cell] = np.arange(len(cell))
         vertices = vertices[kept]
+    surface = Surface(vertices, faces)
     fine = FINEST_GRID
     coarse = COARSEST_GRID
-    cell, merged = _clustered(vertices, faces, coarse, closed=closed)
+    cell, merged = _clustered(surface, coarse, closed=closed)
     for _ in range(GRID_BISECTIONS):
         cells = float(np.sqrt(fine * coarse))
-        finer = _clustered(vertices, faces, cells, closed=closed)
+        finer = _clustered(surface, cells, closed=closed)
         if len(finer[1]) > max_faces:
             fine = cells
         else:
@@ -373,49 +350,51 @@ def cluster_vertices(
             cell, merged = finer
     side = np.ptp(vertices, axis=0)
     used, index = np.unique(merged, return_inverse=True)
-    moved = _quadric_vertices(vertices, faces, cell, float(side.max()) / coarse)[used]
+    moved = _quadric_vertices(surface, cell, float(side.max()) / coarse)[used]
     extent = np.ptp(moved, axis=0)
     scale = np.where(extent > 0.0, side / np.maximum(extent, 1e-30), 1.0)
     moved = vertices.min(axis=0) + (moved - moved.min(axis=0)) * scale
-    return moved, index.reshape(-1, 3).astype(np.int32)
+    return Surface(moved, index.reshape(-1, 3).astype(np.int32))
 
 
-def _clustered(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    cells: float,
-    *,
-    closed: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
-    low = vertices.min(axis=0)
-    size = float(np.ptp(vertices, axis=0).max())
-    x, y, z = np.floor((vertices - low) / size * cells).astype(np.int64).T
+def _clustered(surface: Surface, cells: float, *, closed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Cell of each vertex [V] on a grid, and the triangles left.
+
+    The grid has ``cells`` along the longest side. Each triangle is there once: a thin wall becomes
+    a sheet. What is ``closed`` stays so.
+    """
+    from trimesh.grouping import unique_rows
+
+    away = surface.vertices - surface.vertices.min(axis=0)
+    x, y, z = np.floor(away / float(away.max()) * cells).astype(np.int64).T
     most = int(cells) + 1
     cell = np.unique((x * most + y) * most + z, return_inverse=True)[1].reshape(-1)
-    merged = cell[faces]
+    merged = cell[surface.faces]
     a, b, c = merged.T
-    return cell, _tidied(merged[(a != b) & (b != c) & (c != a)], closed=closed)
+    merged = merged[(a != b) & (b != c) & (c != a)]
+    first, group = unique_rows(np.sort(merged, axis=1))
+    if closed:  # of triangles with equal corners an even number goes
+        first = first[np.bincount(group) % 2 == 1]
+    return cell, merged[np.sort(first)]
 
 
-def _quadric_vertices(
-    vertices: np.ndarray, faces: np.ndarray, cluster: np.ndarray, cell: float
-) -> np.ndarray:
+def _quadric_vertices(surface: Surface, cluster: np.ndarray, cell: float) -> np.ndarray:
     """Vertex of each cluster.
 
     Near its mean, on the planes of its triangles, at most a cell away.
     """
     count = int(cluster.max()) + 1
-    mean = _sums(cluster, vertices, count) / np.bincount(cluster, minlength=count)[:, None]
-    normal = _normals(vertices, faces)
+    sizes = np.bincount(cluster, minlength=count)
+    mean = _sums(cluster, surface.vertices, count) / sizes[:, None]
+    normal = _normals(surface)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal /= np.maximum(length, 1e-30)
     weighted = length * normal
     planes = (weighted[:, :, None] * normal[:, None, :]).reshape(-1, 9)
-    first = vertices[faces[:, 0]]
+    first = surface.vertices[surface.faces[:, 0]]
     sums = np.zeros((count, 9))
     right = np.zeros((count, 3))
-    for corners in cluster[faces].T:
+    for corners in cluster[surface.faces].T:
         offset = np.einsum("ij,ij->i", normal, first - mean[corners])
         right += _sums(corners, weighted * offset[:, None], count)
         sums += _sums(corners, planes, count)

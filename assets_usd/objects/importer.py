@@ -1,4 +1,4 @@
-"""Import of meshes: one child process a mesh, cached by content, resumable, with refusals by name."""
+"""Import of meshes: a child process each, cached by content, resumable, with refusals by name."""
 
 import hashlib
 import json
@@ -118,7 +118,9 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
 
 
 def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
-    """What has to be said of parts that are so far from the surface, on average, as a share of its length.
+    """What has to be said of parts.
+
+    ``offset`` is how far they are from the surface, on average, as a share of its length.
 
     Raises:
         MeshError: They are too far from the mesh.
@@ -169,29 +171,32 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
     source = Path(job.source)
     loaded, load_notes = _simplified(load_mesh(source))
     mesh = repair_mesh(loaded)
-    scale, size_notes, size_warnings = scale_of(settings, mesh.vertices, declared_unit(source))
+    scale, size_notes, size_warnings = scale_of(
+        settings, mesh.surface.vertices, declared_unit(source)
+    )
     mesh = mesh.scaled(scale)
+    surface = mesh.surface
     body = body_of(mesh)
     if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
     mass, mass_notes, mass_warnings = mass_of(settings, body.solid.volume)
-    error_of = error_of_parts(body, mesh.vertices)
+    error_of = error_of_parts(body, surface.vertices)
     if 0 < len(mesh.pieces) <= settings.max_hulls:
         hulls = tidy_hulls([p.vertices for p in mesh.pieces], HULL_VERTICES)
         parts = Decomposition(hulls, "convex pieces", error=error_of(hulls))
     else:
-        coarse = cluster_vertices(mesh.vertices, mesh.faces, MAX_DECOMPOSED_FACES)
-        parts = best_decomposition(*coarse, settings, error_of)
-    offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
-    made = _parts_warnings(parts, offset / np.ptp(mesh.vertices, axis=0).max())
-    drawn = cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES)
-    made += _uncovered(drawn[0], parts.hulls)
+        coarse = cluster_vertices(surface, MAX_DECOMPOSED_FACES)
+        parts = best_decomposition(coarse, settings, error_of)
+    offset = parts.error * body.volume / triangle_areas(surface).sum()
+    made = _parts_warnings(parts, offset / np.ptp(surface.vertices, axis=0).max())
+    drawn = cluster_vertices(surface, MAX_VISUAL_FACES)
+    made += _uncovered(drawn.vertices, parts.hulls)
     return build_model(
         job.name,
-        *drawn,
+        drawn,
         parts.hulls,
         body.solid,
-        surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS),
+        surface_points(surface, SURFACE_POINTS),
         licence=job.licence,
         mass_kg=mass,
         source=job.provenance,
@@ -200,7 +205,9 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         split=job.split,
         scale=scale,
         volume_error=parts.error + cavity_share(mesh, body),
-        volume_method=f"{parts.method}; volume in which parts and solid differ; solid: {body.method}",
+        volume_method=(
+            f"{parts.method}; volume in which parts and solid differ; solid: {body.method}"
+        ),
         # A fall-back forced by a limit may not be needed next time.
         content_hash="" if parts.fallback else content_hash(job, settings),
         notes=(*load_notes, *mesh.notes, *size_notes, *mass_notes),
@@ -210,16 +217,16 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
 
 def _simplified(mesh: Any) -> tuple[Any, list[str]]:
     """A mesh of at most MAX_FACES faces, and what has to be said of it."""
-    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, closed=True)
-    if len(faces) == len(mesh.faces):
+    coarse = cluster_vertices(mesh, MAX_FACES, closed=True)
+    if len(coarse.faces) == len(mesh.faces):
         return mesh, []
-    some = random_surface_points(mesh.vertices, mesh.faces, COMPARED, np.random.default_rng(0))
-    off = distances(vertices, faces, some).max() / mesh.extents.max()
+    some = random_surface_points(mesh, COMPARED, np.random.default_rng(0))
+    off = distances(coarse, some).max() / mesh.extents.max()
     note = (
-        f"simplified from {len(mesh.faces)} to {len(faces)} faces, up to {100 * off:.2g} % of its "
-        f"length off"
+        f"simplified from {len(mesh.faces)} to {len(coarse.faces)} faces, up to "
+        f"{100 * off:.2g} % of its length off"
     )
-    return trimesh.Trimesh(vertices, faces, process=False), [note]
+    return trimesh.Trimesh(*coarse, process=False), [note]
 
 
 def import_meshes(

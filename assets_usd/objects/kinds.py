@@ -87,7 +87,7 @@ def tool(u: Draw) -> Iterator[Hull]:
 
 
 def path(u: Draw) -> Iterator[Hull]:
-    """Bars end to end, each turned against the one before, and a knob: letter, lever, hook, ring."""
+    """Bars end to end, each turned against the last, and a knob: letter, lever, hook, ring."""
     width = u(0.25, 0.5)
     depth = u(0.3, 0.8)
     bend = u(-1.3, 1.3)
@@ -128,7 +128,7 @@ def _walls(
 
 
 def shell(u: Draw) -> Iterator[Hull]:
-    """A trough of four wall pieces with one end closed and a tab: scoop, half a shell, soap dish."""
+    """A trough of four walls with one end closed and a tab: scoop, half a shell, soap dish."""
     radius = u(0.7, 1.1)
     length = u(1.4, 2.6)
     wall = u(0.2, 0.32)

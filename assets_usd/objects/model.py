@@ -28,7 +28,7 @@ from vd.assets_usd.objects.contact_layer import (
     author_contact,
     read_contact,
 )
-from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
+from vd.assets_usd.objects.geometry import Hull, Solid, Surface, principal_axes
 from vd.command.files import atomic_path
 from vd.paper import PAPER
 
@@ -140,8 +140,7 @@ class ObjectModel:
 
 def build_model(
     name: str,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    surface: Surface,
     hulls: Sequence[Hull],
     solid: Solid,
     points: np.ndarray,
@@ -153,8 +152,7 @@ def build_model(
 
     Args:
         name: A valid prim name.
-        vertices: Visual mesh [V, 3], m.
-        faces: [T, 3].
+        surface: Visual mesh, m.
         hulls: Collision parts in the same frame.
         solid: Mass properties at density 1 in the same frame.
         points: Surface points [500, 3] in the same frame.
@@ -164,8 +162,8 @@ def build_model(
     moments, quat = principal_axes(solid.inertia * (mass_kg / solid.volume))
     return ObjectModel(
         name=name,
-        vertices=np.asarray(vertices - solid.centroid, dtype=np.float32),
-        faces=np.asarray(faces, dtype=np.int32),
+        vertices=np.asarray(surface.vertices - solid.centroid, dtype=np.float32),
+        faces=np.asarray(surface.faces, dtype=np.int32),
         hulls=tuple(
             Hull(np.asarray(h.vertices - solid.centroid, np.float32), np.asarray(h.faces, np.int32))
             for h in hulls
@@ -183,14 +181,11 @@ def add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> 
     from pxr import UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, dtype=np.float32)))
-    mesh.CreateFaceVertexIndicesAttr(
-        Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, dtype=np.int32).reshape(-1))
-    )
+    mesh.CreatePointsAttr(np.ascontiguousarray(vertices))
+    mesh.CreateFaceVertexIndicesAttr(np.ascontiguousarray(faces, dtype=np.int32).ravel())
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    extent = np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32)
-    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+    mesh.CreateExtentAttr(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
     return mesh
 
 
@@ -204,7 +199,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     Returns:
         The path.
     """
-    import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
+    import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
     from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
     path = Path(path)
@@ -238,9 +233,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
         collision.CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material, materialPurpose="physics")
     points = UsdGeom.Points.Define(stage, f"{root}/surface_points")
-    points.CreatePointsAttr(
-        Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(model.surface_points, np.float32))
-    )
+    points.CreatePointsAttr(model.surface_points)
     points.CreatePurposeAttr(UsdGeom.Tokens.guide)
     prim.SetCustomDataByKey(
         _CUSTOM,
@@ -249,9 +242,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
             **{_key(name): kind(getattr(model, name)) for name, kind in _STORED.items()},
             "notes": "\n".join(model.notes),
             "warnings": "\n".join(model.warnings),
-            "symmetry": Vt.DoubleArray.FromNumpy(
-                np.ascontiguousarray(model.symmetry, np.float64).reshape(-1)
-            ),
+            "symmetry": Vt.DoubleArray(model.symmetry.ravel().tolist()),
         },
     )
     author_contact(stage.GetRootLayer().GetPrimAtPath(root), model.contact)
@@ -316,8 +307,8 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
-    import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
-    from pxr import Usd, UsdGeom, UsdPhysics
+    import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
+    from pxr import Usd, UsdPhysics
 
     path = Path(path)
     if not path.is_file():
@@ -332,51 +323,47 @@ def read_object(path: Path) -> ObjectModel:
     if data.get("formatVersion") != FORMAT_VERSION:
         raise ObjectError(
             f"{path}: formatVersion is {data.get('formatVersion')}, this version reads "
-            f"{FORMAT_VERSION}; write it again with vd-assets import or vd-assets objects; a "
-            "hand's layer goes to --hand-layer"
+            f"{FORMAT_VERSION}; import it again (vd-assets import); a hand's layer goes to "
+            "--hand-layer"
         )
     stage = Usd.Stage.Open(layer)
     prim = stage.GetDefaultPrim()
     root = prim.GetPath()
 
-    def array(relative: str, attribute: str, columns: int, dtype: Any) -> np.ndarray:
+    def array(relative: str, attribute: str) -> np.ndarray:
         child = stage.GetPrimAtPath(root.AppendPath(relative))
         value = child.GetAttribute(attribute).Get() if child else None
         if value is None or not len(value):
             raise ObjectError(f"{path}: {relative}.{attribute} is missing; import the object again")
-        return np.array(value, dtype=dtype).reshape(-1, columns)
+        return np.array(value).reshape(-1, 3)
+
+    def mesh(relative: str) -> Surface:
+        return Surface(array(relative, "points"), array(relative, "faceVertexIndices"))
 
     try:
         contact = read_contact(prim, str(path))
     except ValueError as error:
         raise ObjectError(str(error)) from error
-    hulls = []
     collision = stage.GetPrimAtPath(root.AppendPath("collision"))
-    for child in collision.GetChildren() if collision else ():
-        if child.HasAPI(UsdPhysics.CollisionAPI) and child.IsA(UsdGeom.Mesh):
-            name = f"collision/{child.GetName()}"
-            hulls.append(
-                Hull(
-                    array(name, "points", 3, np.float32),
-                    array(name, "faceVertexIndices", 3, np.int32),
-                )
-            )
+    parts = collision.GetChildren() if collision else ()
+    hulls = [mesh(f"collision/{part.GetName()}") for part in parts]
     if not hulls:
         raise ObjectError(f"{path}: collision has no hull; import the object again")
+    visual = mesh("visual")
     mass = UsdPhysics.MassAPI(prim)
     axes = mass.GetPrincipalAxesAttr().Get()
     quat = np.array([*axes.GetImaginary(), axes.GetReal()], dtype=np.float64)
     return ObjectModel(
         name=prim.GetName(),
-        vertices=array("visual", "points", 3, np.float32),
-        faces=array("visual", "faceVertexIndices", 3, np.int32),
+        vertices=visual.vertices,
+        faces=visual.faces,
         hulls=tuple(hulls),
         mass_kg=float(mass.GetMassAttr().Get()),
         centre_of_mass=tuple(map(float, mass.GetCenterOfMassAttr().Get() or (0.0, 0.0, 0.0))),
         contact=contact,
         inertia=np.array(mass.GetDiagonalInertiaAttr().Get(), dtype=np.float64),
         inertia_quat=quat / np.linalg.norm(quat),
-        surface_points=array("surface_points", "points", 3, np.float32),
+        surface_points=array("surface_points", "points"),
         symmetry=np.array(data["symmetry"], dtype=np.float64).reshape(-1, 4),
         **{name: kind(data.get(_key(name), "")) for name, kind in _STORED.items()},
         notes=tuple(str(data["notes"]).splitlines()),
@@ -426,6 +413,5 @@ def write_contact_layer(
 
 def object_files(folder: Path) -> list[Path]:
     """The object files of a set's folder, sorted by name."""
-    return sorted(
-        p for p in Path(folder).iterdir() if p.suffix in SUFFIXES and not p.name.startswith(".")
-    )
+    files = sorted(Path(folder).glob("[!.]*"))
+    return [file for file in files if file.suffix in SUFFIXES]

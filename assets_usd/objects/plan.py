@@ -17,9 +17,10 @@ from vd.assets_usd.objects.usd_mesh import usd_files
 GENERIC_WORDS = frozenset(
     re.findall(
         r"\w+",
-        """asset clean cleaned collision convex decimated export exported geometry glb google highres lowres
-        merged mesh meshes model models nontextured normalized obj object objects output ply poisson processed
-        scan scene simple simplified stl textured tsdf untitled usd visual watertight""",
+        """asset clean cleaned collision convex decimated export exported geometry glb google
+        highres lowres merged mesh meshes model models nontextured normalized obj object objects
+        output ply poisson processed scan scene simple simplified stl textured tsdf untitled usd
+        visual watertight""",
     )
 )
 """Words that say what kind of file something is, not of what thing. Data sets have a folder for
@@ -67,7 +68,7 @@ def prim_name(stem: str) -> str:
 
 
 def says_nothing(word: str) -> bool:
-    """Whether a file's stem or a folder's name is of ``GENERIC_WORDS`` and resolutions (16k) alone."""
+    """Whether a file's or folder's name is of ``GENERIC_WORDS`` and resolutions (16k) alone."""
     words = [part for part in re.split(r"[\W_]+", word.lower()) if part]
     return all(part in GENERIC_WORDS or re.fullmatch(r"\d+k", part) for part in words)
 
@@ -93,7 +94,7 @@ def object_name(path: Path) -> str:
 
 
 def find_meshes(paths: Iterable[Path]) -> list[Path]:
-    """Mesh files among files and folders (searched in depth), each once, in a fixed order, absolute.
+    """Mesh files among files and folders, each once, in a fixed order, absolute.
 
     A file that was named is kept whatever it is, so that it is refused by name. In a folder files
     count that have a mesh's suffix. Left out are what is hidden, our own objects, and parts of a
@@ -174,12 +175,14 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
         raise MeshError(
             "two meshes would have one name in the set:\n"
             + "\n".join(clashes[:CLASHES_SHOWN])
-            + f"{more}\nName only the files that you want (such as FOLDER/*/textured.obj), rename one, "
-            "or import one into another set (--out)"
+            + f"{more}\nName only the files that you want (such as FOLDER/*/textured.obj), "
+            "rename one, or import one into another set (--out)"
         )
-    sidecars = {folder: read_sidecar(folder) for folder in {mesh.parent for mesh in taken.values()}}
+    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
     jobs = []
     for name, mesh in taken.items():
+        if mesh.parent not in sidecars:
+            sidecars[mesh.parent] = read_sidecar(mesh.parent)
         row = sidecars[mesh.parent].get(mesh.stem, {})
         source = row.get("source") or ""
         bracket = re.search(r"\(([^)]*)\)", source)

@@ -50,16 +50,19 @@ def _placed(points: np.ndarray, centre: Vector, euler: Vector) -> Hull:
     return convex_hull(Rotation.from_euler("xyz", euler).apply(points) + centre)
 
 
-def _frame(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors: from a to b, and two across."""
-    axis = (b - a) / np.linalg.norm(b - a)
+def _frame(start: Vector, end: Vector) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two points as they are [2, 3], a unit vector from one to the other, and two across [2, 3]."""
+    ends = np.array([start, end], dtype=float)
+    axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     u = np.cross(axis, helper)
     u /= np.linalg.norm(u)
-    return axis, u, np.cross(axis, u)
+    return ends, axis, np.stack([u, np.cross(axis, u)])
 
 
-def _ring(u: np.ndarray, v: np.ndarray, sides: int, phase: float = 0.0) -> np.ndarray:
+def _ring(across: np.ndarray, sides: int, phase: float = 0.0) -> np.ndarray:
+    """Points on a unit circle in the plane of two vectors [sides, 3]."""
+    u, v = across
     angle = 2.0 * np.pi * np.arange(sides) / sides + phase
     return np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
 
@@ -80,40 +83,24 @@ def ellipsoid(centre: Vector, radii: Vector, *, euler: Vector = (0, 0, 0)) -> Hu
 
 def rod(start: Vector, end: Vector, radius: float, end_radius: float | None = None) -> Hull:
     """Capsule between two points, tapered if ``end_radius`` is given; 30 vertices."""
-    a = np.asarray(start, dtype=float)
-    b = np.asarray(end, dtype=float)
-    axis, u, v = _frame(a, b)
-    return convex_hull(
-        np.concatenate(
-            [
-                _rounded_end(a, -axis, u, v, radius),
-                _rounded_end(b, axis, u, v, radius if end_radius is None else end_radius),
-            ]
-        )
-    )
-
-
-def _rounded_end(
-    centre: np.ndarray, out: np.ndarray, u: np.ndarray, v: np.ndarray, radius: float
-) -> np.ndarray:
-    """A ring, a smaller one and the pole of a half ball that looks out, [15, 3]."""
-    cap = (_ring(u, v, 6, 0.3) + out) / 2.0**0.5
-    return centre + radius * np.concatenate([_ring(u, v, 8), cap, out[None]])
+    ends, axis, across = _frame(start, end)
+    radii = [radius, radius if end_radius is None else end_radius]
+    points = []
+    for centre, out, size in zip(ends, (-axis, axis), radii, strict=True):
+        # A ring, a smaller one and the pole of a half ball that looks out.
+        cap = (_ring(across, 6, 0.3) + out) / 2.0**0.5
+        points.append(centre + size * np.concatenate([_ring(across, 8), cap, out[None]]))
+    return convex_hull(np.concatenate(points))
 
 
 def cylinder(
     start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = SIDES
 ) -> Hull:
     """Cylinder or truncated cone between two points."""
-    a = np.asarray(start, dtype=float)
-    b = np.asarray(end, dtype=float)
-    _, u, v = _frame(a, b)
-    ring = _ring(u, v, sides)
-    return convex_hull(
-        np.concatenate(
-            [a + radius * ring, b + (radius if end_radius is None else end_radius) * ring]
-        )
-    )
+    ends, _, across = _frame(start, end)
+    ring = _ring(across, sides)
+    last = radius if end_radius is None else end_radius
+    return convex_hull(np.concatenate([ends[0] + radius * ring, ends[1] + last * ring]))
 
 
 def prism(outline: npt.ArrayLike, low: float, high: float, *, axis: str = "y") -> Hull:
@@ -127,7 +114,7 @@ def prism(outline: npt.ArrayLike, low: float, high: float, *, axis: str = "y") -
 
 
 def beam(start: npt.ArrayLike, end: npt.ArrayLike, width: float, depth: float) -> Hull:
-    """Flat stroke between two points of the x-z plane, ``width`` wide in it and ``depth`` thick along y."""
+    """Flat stroke between two points of the x-z plane, ``width`` wide, ``depth`` thick along y."""
     a = np.asarray(start, dtype=float)
     b = np.asarray(end, dtype=float)
     along = (b - a) / np.linalg.norm(b - a)

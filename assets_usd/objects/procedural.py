@@ -1,6 +1,6 @@
 """Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ from trimesh.util import append_faces
 from vd.assets_usd.objects.bodies import solid_by_points
 from vd.assets_usd.objects.geometry import (
     Hull,
+    Surface,
     hull_depth,
     inside,
     solid_of_mesh,
@@ -38,9 +39,9 @@ CUBOID_SIDES_M = (0.05, 0.07, 0.10)
 """Sides of the cuboid, all different: its group is the four rotations of a brick."""
 
 THINNEST_M = 0.015
-"""Least shortest side of an object that would be longer than ``LONGEST_SIDE_M`` where it is as thick
-as other objects. What is flatter is out of reach where it lies: straight fingers of dclaw4 end 9 mm
-above the table under their roots, 17 mm above it in the middle.
+"""Least shortest side of an object that would be longer than ``LONGEST_SIDE_M`` where it is as
+thick as other objects. What is flatter is out of reach where it lies: straight fingers of dclaw4
+end 9 mm above the table under their roots, 17 mm above it in the middle.
 """
 
 MIN_ASYMMETRY = 0.012
@@ -87,11 +88,8 @@ def asymmetry(model: ObjectModel) -> float:
     return least / model.longest_side
 
 
-def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of all parts, without those wholly inside another part.
-
-    Vertices [V, 3], faces [T, 3].
-    """
+def union_surface(hulls: Sequence[Hull]) -> Surface:
+    """Triangles of all parts, without those wholly inside another part."""
     vertices = []
     faces = []
     for i, hull in enumerate(hulls):
@@ -102,8 +100,8 @@ def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
         used, index = np.unique(hull.faces[~inside], return_inverse=True)
         vertices.append(hull.vertices[used])
         faces.append(index.reshape(-1, 3))
-    joined, triangles = append_faces(vertices, faces)
-    return joined, triangles.astype(np.int32)
+    corners, triangles = append_faces(vertices, faces)
+    return Surface(corners, triangles.astype(np.int32))
 
 
 def model_of_parts(
@@ -120,16 +118,15 @@ def model_of_parts(
     everything = np.concatenate([h.vertices for h in hulls])
     scale = 1.0 if longest_side is None else longest_side / float(np.ptp(everything, axis=0).max())
     parts = [hull.times(scale) for hull in hulls]
-    vertices, faces = union_surface(parts)
-    points = surface_points(vertices, faces, SURFACE_POINTS, outside=parts)
-    corners, triangles = append_faces(*zip(*parts, strict=True))
-    solid = solid_of_mesh(corners, triangles)
+    surface = union_surface(parts)
+    points = surface_points(surface, SURFACE_POINTS, outside=parts)
+    whole = Surface(*append_faces(*zip(*parts, strict=True)))
+    solid = solid_of_mesh(whole)
     if len(parts) > 1:
-        solid = solid_by_points(corners, partial(inside, corners, triangles), GRID)
+        solid = solid_by_points(whole.vertices, partial(inside, whole), GRID)
     return build_model(
         name,
-        vertices,
-        faces,
+        surface,
         parts,
         solid,
         points,
@@ -177,20 +174,13 @@ def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> Ob
     raise RuntimeError(f"{name}: no valid object in {ATTEMPTS} draws")
 
 
-def procedural_set(
-    count: int,
-    seed: int,
-    *,
-    families: str = "training",
-    progress: Callable[[str, int, int], None] | None = None,
-) -> list[ObjectModel]:
+def procedural_set(count: int, seed: int, *, families: str = "training") -> list[ObjectModel]:
     """Objects of every kind in turn, deterministic from the seed.
 
     Args:
         count: Number of objects.
         seed: Seed of the set. Object i depends on the families, the seed and i alone.
         families: ``training`` or ``heldout`` (``KINDS``).
-        progress: Called with each name, the number done and the number of all.
     """
     kinds = KINDS[families]
     word = list(KINDS).index(families)
@@ -209,8 +199,6 @@ def procedural_set(
             content_hash=f"procedural-{PROCEDURAL_VERSION}-{word}-{seed}-{i}",
         )
         models.append(model)
-        if progress:
-            progress(name, i + 1, count)
     return models
 
 

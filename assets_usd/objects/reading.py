@@ -122,7 +122,7 @@ def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError(f"neither mesh nor points: {type(error).__name__}: {error}") from error
     if len(faces) < declared:
         raise MeshError(
-            f"declares {declared} faces, of which {len(faces)} could be read: cut short or damaged; "
-            "get it again, or export it again"
+            f"declares {declared} faces, of which {len(faces)} could be read: cut short or "
+            "damaged; get it again, or export it again"
         )
     return vertices, faces

@@ -12,6 +12,7 @@ import trimesh
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
+    Surface,
     convex_hull,
     hull_volume,
     inside,
@@ -67,25 +68,21 @@ class RepairedMesh:
     """The outer surface of an object in its own units, and what is hollow in it.
 
     Attributes:
-        vertices: [V, 3] float64.
-        faces: [T, 3] int32.
+        surface: The outer surface, float64 and int32.
         closed: It has no edge, and encloses a volume.
         watertight: Closed, consistently wound and of one piece.
         pieces: Convex hulls of the closed pieces if all are convex, else empty: such a mesh is
             decomposed as it stands.
-        cavity_vertices: Vertices of closed surfaces within [W, 3].
-        cavity_faces: Their faces [H, 3], wound as those of the solid: inward around a cavity.
+        cavities: Closed surfaces within, wound as those of the solid: inward around a cavity.
         notes: What was done.
         warnings: What may be wrong with the object.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    surface: Surface
     closed: bool
     watertight: bool
     pieces: tuple[Hull, ...]
-    cavity_vertices: np.ndarray
-    cavity_faces: np.ndarray
+    cavities: Surface
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -93,9 +90,9 @@ class RepairedMesh:
         """The mesh times a factor."""
         return replace(
             self,
-            vertices=self.vertices * factor,
+            surface=self.surface.times(factor),
             pieces=tuple(hull.times(factor) for hull in self.pieces),
-            cavity_vertices=self.cavity_vertices * factor,
+            cavities=self.cavities.times(factor),
         )
 
 
@@ -137,17 +134,14 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         notes.append("fixed winding")
         trimesh.repair.fix_winding(mesh)
     mesh = _filled_holes(mesh, notes)
-    cavity_vertices = mesh.vertices
-    mesh, pieces, cavity_faces = _turned_outward(mesh, notes, warnings)
+    mesh, pieces, cavities = _turned_outward(mesh, notes, warnings)
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0)
     return RepairedMesh(
-        np.asarray(mesh.vertices, dtype=np.float64),
-        np.asarray(mesh.faces, dtype=np.int32),
+        Surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)),
         closed,
         closed and mesh.body_count == 1,
         pieces,
-        cavity_vertices,
-        cavity_faces,
+        cavities,
         tuple(notes),
         tuple(warnings),
     )
@@ -305,13 +299,14 @@ def _containers(pieces: _Pieces) -> tuple[np.ndarray, np.ndarray]:
         if not volume[outer]:
             break
         faces = meshes[outer].faces
-        surface = faces if volume[outer] > 0.0 else faces[:, ::-1]
+        outward = faces if volume[outer] > 0.0 else faces[:, ::-1]
+        surface = Surface(meshes[outer].vertices, outward)
         for inner in np.flatnonzero(
             (low > low[outer]).all(axis=1) & (high < high[outer]).all(axis=1)
         ):
             corners = meshes[inner].vertices
             some = corners[:: max(1, len(corners) // INSIDE_SAMPLES)]
-            if inside(meshes[outer].vertices, surface, some).all():
+            if inside(surface, some).all():
                 smallest[inner] = outer
                 largest[inner] = outer if largest[inner] == inner else largest[inner]
     return largest, smallest
@@ -338,7 +333,7 @@ def _filled_holes(mesh: Any, notes: list[str]) -> Any:
         centres.append(mesh.vertices[loop].mean(axis=0))
         fans += [(middle, b, a) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
     vertices = np.concatenate([mesh.vertices, centres])
-    filled = float(triangle_areas(vertices, np.array(fans)).sum())
+    filled = float(triangle_areas(Surface(vertices, np.array(fans))).sum())
     if filled > FILLED_AREA * (mesh.area + filled):
         return mesh
     notes.append(f"filled {len(centres)} hole{'s' if len(centres) > 1 else ''}")
@@ -347,8 +342,8 @@ def _filled_holes(mesh: Any, notes: list[str]) -> Any:
 
 def _turned_outward(
     mesh: Any, notes: list[str], warnings: list[str]
-) -> tuple[Any, tuple[Hull, ...], np.ndarray]:
-    """The outer surface with its closed pieces wound outward, its convex pieces, and the cavities' faces.
+) -> tuple[Any, tuple[Hull, ...], Surface]:
+    """The outer surface with its closed pieces wound outward, its convex pieces, and the cavities.
 
     A closed piece in another is a cavity if it is wound the other way round, and else inside of the
     solid. What is in a cavity is solid again.
@@ -381,7 +376,7 @@ def _turned_outward(
         notes.append(
             f"{len(hulls)} convex piece{'s' if len(hulls) > 1 else ''}: nothing to decompose"
         )
-    return kept, hulls, faces[border[of_face]]
+    return kept, hulls, Surface(mesh.vertices, faces[border[of_face]])
 
 
 def _convex_hulls(pieces: list[Any], outer: np.ndarray) -> tuple[Hull, ...]:

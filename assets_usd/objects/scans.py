@@ -29,7 +29,10 @@ MARGIN_CELLS = 12
 
 
 def smooth(points: np.ndarray) -> np.ndarray:
-    """Samples of a surface [N, 3], at least NEIGHBOURS, each moved onto the plane through those near it."""
+    """Samples of a surface [N, 3], each moved onto the plane through those near it.
+
+    N is at least NEIGHBOURS.
+    """
     rows = cKDTree(points).query(points, NEIGHBOURS)[1]
     middle = points[rows].mean(axis=1)
     apart = points[rows] - middle[:, None]

@@ -7,7 +7,7 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdUtils, Vt
 from trimesh.util import append_faces
 
-from vd.assets_usd.objects.geometry import MeshError
+from vd.assets_usd.objects.geometry import MeshError, Surface
 from vd.assets_usd.objects.model import is_object
 
 _UNREAD = (
@@ -65,8 +65,8 @@ def usd_files(path: Path) -> list[Path]:
     return sorted(file for file in used | {path.resolve()} if file.is_file())
 
 
-def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and triangles [T, 3] of all visible meshes below the default prim.
+def read_usd(path: Path) -> Surface:
+    """All visible meshes below the default prim.
 
     Meshes for rendering are taken; where there are none, stand-ins (purpose ``proxy``). Those of
     purpose ``guide``, mostly colliders, are not. A surface to be subdivided is taken by its cage.
@@ -91,7 +91,7 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = append_faces(*zip(*parts, strict=True))
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         vertices = vertices @ Z_FROM_Y.T
-    return vertices, faces
+    return Surface(vertices, faces)
 
 
 def _shown(stage: Any) -> list[Any]:
@@ -110,8 +110,8 @@ def _shown(stage: Any) -> list[Any]:
     return rendered or stand_ins
 
 
-def mesh_triangles(prim: Any, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and triangles [T, 3] of a UsdGeomMesh: polygons become fans.
+def mesh_triangles(prim: Any, matrix: np.ndarray) -> Surface:
+    """A UsdGeomMesh as triangles: polygons become fans.
 
     Args:
         prim: The mesh.
@@ -138,4 +138,4 @@ def mesh_triangles(prim: Any, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarra
     mirrored = np.linalg.det(linear) < 0.0
     if mirrored != (mesh.GetOrientationAttr().Get(first) == UsdGeom.Tokens.leftHanded):
         faces = faces[:, ::-1]
-    return np.array(points, dtype=float) @ linear + matrix[3, :3], faces
+    return Surface(np.array(points, dtype=float) @ linear + matrix[3, :3], faces)

@@ -97,16 +97,14 @@ def scan_object(path: Path) -> ObjectModel:
     except MeshError as error:
         raise GoalError(f"{path}: {error}; scan it again, or export it as PLY") from error
     factor = _unit(path, float(np.ptp(surface.vertices, axis=0).max()))
-    vertices = surface.vertices * factor
-    faces = surface.faces
+    surface = surface.times(factor)
     try:
         return build_model(
             "scan",
-            vertices,
-            faces,
-            [convex_hull(vertices)],
-            solid_of_mesh(vertices, faces),
-            surface_points(vertices, faces, SURFACE_POINTS),
+            surface,
+            [convex_hull(surface.vertices)],
+            solid_of_mesh(surface),
+            surface_points(surface, SURFACE_POINTS),
             source=str(path),
             family="scan",
             scale=factor,
@@ -178,8 +176,8 @@ def _surface(path: Path, generator: np.random.Generator) -> Surface:
     if len(loaded.faces):
         mesh = repair_mesh(loaded)
         if mesh.watertight:
-            return Surface(mesh.vertices, mesh.faces)
-        points = random_surface_points(mesh.vertices, mesh.faces, CANDIDATES, generator)
+            return mesh.surface
+        points = random_surface_points(mesh.surface, CANDIDATES, generator)
     else:
         points = vertices[generator.permutation(len(vertices))[:CANDIDATES]]
     if len(points) < LEAST_POINTS:

@@ -167,7 +167,7 @@ class DriveCfg(HandOptions):
         if self.log is not None and self.log.suffix == MCAP:
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
-            interrupt.need("mcap_ros2")
+            interrupt.need("mcap_ros2", "rosbags")
 
 
 def run(cfg: DriveCfg) -> int:

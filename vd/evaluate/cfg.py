@@ -165,7 +165,8 @@ class EvalCfg(HandFlags, EpisodeFlags):
     nothing else; the others change one thing, which the page of --suite robust names."""
     plan: tyro.conf.FlagCreatePairsOff[bool] = False
     """Plan every step by sampling 256 futures of a second, with the nominal simulator as model. A
-    teacher proposes half of them; ``zero --plan`` needs none. It tells what physics allows: GPUs."""
+    teacher proposes half of them; ``zero --plan`` needs none. It tells what physics allows: GPUs.
+    """
     engine: Engine = "newton"
     """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the
     CPU.

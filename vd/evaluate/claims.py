@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from vd.evaluate.result import Row
-from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
+from vd.evaluate.statistics import Interval, rate_intervals
 from vd.evaluate.suite import Claim
 from vd.paper import PAPER
 
 
 def claimed(claim: Claim, rows: Sequence[Row]) -> Any:
-    """Our figure, from the rows of one policy in an evaluation; None where it has no such figure."""
+    """Our figure, from the rows of one policy in an evaluation; None where it has none."""
     for row in rows:
         if row.stopped_by == claim.stopped_by or (claim.stopped_by is None and row.headline):
             return measured(row, claim.measure)
@@ -20,7 +20,7 @@ def claimed(claim: Claim, rows: Sequence[Row]) -> Any:
 
 
 def measured(row: Row, measure: str) -> Any:
-    """A measure of a row: fields and keys with ``/`` between, or the name of one of these functions.
+    """A measure of a row: fields and keys with ``/`` between, or a name of ``OF_EPISODES``.
 
     None where it has no meaning.
     """
@@ -47,8 +47,7 @@ def success_without_table(row: Row) -> Interval:
 
 
 def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
-    objects = len(row.object_names)
-    return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
+    return rate_intervals(np.reshape(chosen, (1, len(row.object_names), -1)))[0]
 
 
 OF_EPISODES = {"lost_at_once": lost_at_once, "success_without_table": success_without_table}

@@ -2,8 +2,6 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from datetime import date
 from itertools import chain
@@ -214,6 +212,7 @@ def planning(actor: Any, agent: "Agent", env: "ReorientEnv", seed: int) -> tuple
 def run_episodes(cfg: EvalCfg, env: "ReorientEnv", actor: Any, agent: "Agent") -> "Trace":
     """All episodes of one policy, with a progress bar."""
     import numpy as np
+    from tqdm import tqdm
 
     from vd.evaluate.rollout import draw_starts_and_goals, draw_turns
     from vd.evaluate.trace import record
@@ -231,7 +230,13 @@ def run_episodes(cfg: EvalCfg, env: "ReorientEnv", actor: Any, agent: "Agent") -
     if schedule.most > 1:
         turns = draw_turns(names, cfg.episodes, schedule.most, **draw)
     ways = agent.ways_to_stop(cfg.stop_tolerance, schedule).values()
-    with _progress(cfg, env, agent) as on_step:
+    rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
+    with tqdm(
+        total=rounds * env.max_episode_steps,
+        unit="step",
+        desc=Path(agent.policy).name or agent.policy,
+        mininterval=0.5 if sys.stderr.isatty() else LOG_EVERY_S,
+    ) as bar:
         trace = record(
             env,
             actor,
@@ -242,24 +247,10 @@ def run_episodes(cfg: EvalCfg, env: "ReorientEnv", actor: Any, agent: "Agent") -
             turns=turns,
             starts=starts,
             goals=goals,
-            on_step=on_step,
+            on_step=bar.update,
         )
     env.check()
     return trace
-
-
-@contextmanager
-def _progress(cfg: EvalCfg, env: "ReorientEnv", agent: "Agent") -> "Iterator[Callable[[], object]]":
-    """A progress bar over the steps of one policy; what is to be called after each."""
-    from tqdm import tqdm
-
-    rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
-    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
-    title = Path(agent.policy).name or agent.policy
-    with tqdm(
-        total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh
-    ) as bar:
-        yield bar.update
 
 
 def envs_for(

@@ -1,4 +1,4 @@
-"""What camera policies know of shapes and goals, and schedules of goals; a leaf, for command lines."""
+"""What camera policies know of shapes and goals, and schedules of goals; for command lines."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -22,7 +22,7 @@ class GoalSchedule:
     goal_s: float = PAPER.scene.episode_s
     """Time for each [s]."""
     first_s: float = 0.0
-    """When the first goal that counts is given [s]; 0: that of the start. Before, there is another."""
+    """When the first goal that counts is given [s]; 0: at the start. Before, there is another."""
     table_s: float | None = None
     """When the table is taken away [s]; None: never."""
     hold_s: float = HOLD_S

@@ -9,7 +9,7 @@ import numpy as np
 
 from vd.command.page import write_html
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, HOLD_S
-from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row, Summary
+from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def shown_name(text: str) -> str:
 
 
 def labels(names: Sequence[str]) -> dict[str, str]:
-    """Short names of policies: the last part of each path where that is another than of all others."""
+    """Short names of policies: the last part of each path where no other has the same."""
     paths = {}
     for name in names:
         path = Path(name)
@@ -82,11 +82,13 @@ def shortened(result: Result) -> Result:
     return replace(result, rows=rows)
 
 
-def percent(interval: Interval | None) -> str:
-    """``12.3 % (10.1 to 14.9)``, or for None that it was not tried."""
-    if interval is None:
-        return "not tried"
-    return f"{100 * interval.value:.1f} % ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+def percent(rate: Interval | float | None) -> str:
+    """``12.3 % (10.1 to 14.9)``, without its interval ``12.3 %``, or a dash for None."""
+    if rate is None:
+        return NOTHING
+    if isinstance(rate, Interval):
+        return f"{100 * rate.value:.1f} % ({100 * rate.low:.1f} to {100 * rate.high:.1f})"
+    return f"{100 * rate:.1f} %"
 
 
 def number(interval: Interval | None) -> str:
@@ -101,11 +103,6 @@ def points(difference: Interval) -> str:
     low = 100 * difference.low
     high = 100 * difference.high
     return f"{100 * difference.value:+.1f} points ({low:+.1f} to {high:+.1f})"
-
-
-def share(value: float | None) -> str:
-    """``12.3 %``, or that there is none."""
-    return "none" if value is None else f"{100 * value:.1f} %"
 
 
 def write_page(
@@ -158,41 +155,25 @@ def write_page(
 
 
 def terminal_text(result: Result) -> str:
-    """Tables, warnings and settings, for a terminal.
-
-    Of one policy without a suite by object too.
-    """
+    """The main tables, warnings and settings, for a terminal; the page has all others."""
     if not result.rows:
         return ""
     result = shortened(result)
-    parts = []
-    for header, rows in (_success_table(result.rows), _beside_table(result.rows)):
-        lines = [header]
-        for row in rows:
-            # Only the first figure has its interval here: a line has to fit.
-            figures = [cell.split(" (")[0] for cell in row[WORDS + 1 :]]
-            lines.append([*row[: WORDS + 1], *figures])
-        parts.append(aligned(lines, words=WORDS))
+    header, rows = _success_table(result.rows)
+    lines = [header]
+    for row in rows:
+        # Only the first figure has its interval here: a line has to fit.
+        figures = [cell.split(" (")[0] for cell in row[WORDS + 1 :]]
+        lines.append([*row[: WORDS + 1], *figures])
+    parts = [aligned(lines, words=WORDS)]
     for header, rows in (_air_table(result.rows), _consecutive_table(result.rows)):
         if rows:
             parts.append(aligned([header, *rows], words=2))
-    suite = any(row.condition for row in result.rows)
-    if len(result.policies) == 1 and not suite:
-        parts += _object_parts(result)
     parts += map("  ".join, _differences(result))
     parts += [f"warning {name}: {warning}" for name, warning in result.warnings.items()]
-    if not suite:
+    if not any(row.condition for row in result.rows):
         parts.append(settings_text([row.protocol for row in result.rows]))
     return "\n\n".join(parts)
-
-
-def _object_parts(result: Result) -> list[str]:
-    parts = []
-    for row in result.rows:
-        if row.headline:
-            header, rows = _object_table(row)
-            parts.append(f"{_heading(row)}\n{aligned([header, *rows], words=1)}")
-    return parts
 
 
 def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
@@ -287,15 +268,16 @@ def _names(row: Row) -> tuple[str, str, str]:
 
 def _object_table(row: Row) -> Table:
     """All objects of a row, and each."""
-    return _OBJECT_HEADER, [_object_cells(summary) for summary in (row.overall, *row.per_object)]
-
-
-def _object_cells(summary: Summary) -> list[str]:
-    cells = [summary.name]
-    cells += map(percent, summary.outcomes.values())
-    cells.append(percent(summary.symmetric))
-    cells.append(number(summary.median_error_rad))
-    return cells
+    lines = [
+        (
+            summary.name,
+            *map(percent, summary.outcomes.values()),
+            percent(summary.symmetric),
+            number(summary.median_error_rad),
+        )
+        for summary in (row.overall, *row.per_object)
+    ]
+    return _OBJECT_HEADER, lines
 
 
 def _air_table(rows: Sequence[Row]) -> Table:
@@ -309,10 +291,10 @@ def _air_table(rows: Sequence[Row]) -> Table:
                     row.policy,
                     _where(row),
                     percent(air.held),
-                    share(air.first),
+                    percent(air.first),
                     percent(air.in_a_row),
-                    share(air.lost),
-                    share(air.let_go),
+                    percent(air.lost),
+                    percent(air.let_go),
                 )
             )
     return _AIR_HEADER, lines
@@ -331,9 +313,9 @@ def _consecutive_table(rows: Sequence[Row]) -> Table:
                     _where(row) if count.name == "all" else count.name,
                     f"{count.mean:.1f}",
                     f"{count.median:g}",
-                    share(count.goals),
-                    share(count.lost),
-                    share(count.full),
+                    percent(count.goals),
+                    percent(count.lost),
+                    percent(count.full),
                 )
             )
     return _CONSECUTIVE_HEADER, lines
@@ -352,8 +334,8 @@ def _bound_table(rows: Sequence[Row]) -> Table:
                     row.policy,
                     _where(row),
                     bound,
-                    share(seen),
-                    share(prediction.right[bound]),
+                    percent(seen),
+                    percent(prediction.right[bound]),
                     f"{prediction.mean_error_rad:.2f}",
                 )
             )

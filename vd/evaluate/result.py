@@ -25,7 +25,7 @@ from vd.evaluate.statistics import (
     rate_intervals,
     share_among,
 )
-from vd.evaluate.trace import Episode, StopsBy, Trace, Way, at_steps
+from vd.evaluate.trace import Episode, Trace, Way, at_steps
 from vd.paper import PAPER
 from vd.policy.stopping import StoppingRule
 from vd.sim.cfg import Engine
@@ -210,7 +210,7 @@ class Row:
 
     @property
     def headline(self) -> bool:
-        """Whether it is judged first: by the prediction of who makes one, else by the true distance."""
+        """Whether it is judged first: by the prediction if there is one, else the true distance."""
         by_prediction = self.sees.endswith("clouds")
         return self.stopped_by == ("prediction" if by_prediction else "true distance")
 
@@ -247,14 +247,13 @@ class Result:
         return headlines
 
     def differences(self) -> list[tuple[Row, Row, Interval]]:
-        """Every other policy beside the first, and how much larger its share of success is, paired."""
+        """Every policy beside the first, and how much larger its share of success is, paired."""
         differences = []
         for row_of in self.headlines().values():
             first, *others = row_of.values()
             for other in others:
                 if other.protocol.episodes == first.protocol.episodes:
-                    unit = first.overall.unit
-                    interval = paired_difference(other.successes, first.successes, unit)
+                    interval = paired_difference(other.successes, first.successes)
                     differences.append((first, other, interval))
         return differences
 
@@ -340,19 +339,22 @@ def judge(
     group: str,
     condition: str = "",
 ) -> list[Row]:
-    """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
+    """Rows of one policy, one for each way to stop, from its episodes with a group of objects."""
     tolerance = protocol.stop_tolerance_rad
     schedule = trace.schedule
     in_a_row = schedule.most > 1
     in_air = in_a_row and schedule.first_s > 0.0
-    unit = choose_unit(len(objects))
     names = tuple(item.name for item in objects)
     rows = []
     for stopped_by, way in agent.ways_to_stop(tolerance, schedule).items():
         rule, by = way
         episodes = trace.episodes(rule, by)
-        by_symmetry = "error" if by == "exact" else by
-        alike = _stopped_within(trace, rule, by_symmetry, trace.error, tolerance)
+        of_symmetry: Way = (rule, "error" if by == "exact" else by)
+        alike = _stopped_within(trace, of_symmetry, trace.error, tolerance)
+        per_object = []
+        for k, name in enumerate(names):
+            chosen = slice(k * protocol.episodes, (k + 1) * protocol.episodes)
+            per_object.append(summarise(name, episodes[chosen], alike[k : k + 1], protocol))
         rows.append(
             Row(
                 policy=agent.policy,
@@ -364,44 +366,33 @@ def judge(
                 rule=rule,
                 protocol=protocol,
                 object_names=names,
-                overall=summarise("all", episodes, alike, protocol, unit),
-                per_object=_per_object(names, episodes, alike, protocol),
-                held=None if in_a_row else _held(trace, way, tolerance, unit),
-                precise=None if in_a_row else _precise(trace, agent, stopped_by, unit),
+                overall=summarise("all", episodes, alike, protocol),
+                per_object=tuple(per_object),
+                held=None if in_a_row else _held(trace, way, tolerance),
+                precise=None if in_a_row else _precise(trace, agent, stopped_by),
                 prediction=_prediction(trace) if by == "predicted" and not in_a_row else None,
                 warnings=_warnings(trace, agent, objects, condition),
                 episodes=episodes,
-                in_air=_in_air(trace, way, unit) if in_air else None,
+                in_air=_in_air(trace, way) if in_air else None,
                 consecutive=_consecutive(trace, names) if in_a_row and not in_air else (),
             )
         )
     return rows
 
 
-def _per_object(
-    names: Sequence[str], episodes: tuple[Episode, ...], alike: np.ndarray, protocol: Protocol
-) -> tuple[Summary, ...]:
-    count = protocol.episodes
-    summaries = []
-    for k, name in enumerate(names):
-        of_object = episodes[k * count : (k + 1) * count]
-        summaries.append(summarise(name, of_object, alike[k : k + 1], protocol, "episode"))
-    return tuple(summaries)
-
-
-def _held(trace: Trace, way: Way, tolerance: float, unit: Unit) -> Interval | None:
+def _held(trace: Trace, way: Way, tolerance: float) -> Interval | None:
     """Share of episodes stopped a way within a tolerance [rad], and held there."""
     if way not in trace.held:
         return None
-    stopped = _stopped_within(trace, *way, trace.exact, tolerance)
-    return rate_intervals((stopped & (trace.held[way] <= tolerance))[None], unit)[0]
+    stopped = _stopped_within(trace, way, trace.exact, tolerance)
+    return rate_intervals((stopped & (trace.held[way] <= tolerance))[None])[0]
 
 
-def _precise(trace: Trace, agent: Agent, stopped_by: StoppedBy, unit: Unit) -> Interval:
+def _precise(trace: Trace, agent: Agent, stopped_by: StoppedBy) -> Interval:
     """Share of episodes stopped within 0.1 rad by the rule for that."""
     tolerance = PAPER.success.precise_rad
-    rule, by = agent.ways_to_stop(tolerance)[stopped_by]
-    return rate_intervals(_stopped_within(trace, rule, by, trace.exact, tolerance)[None], unit)[0]
+    way = agent.ways_to_stop(tolerance)[stopped_by]
+    return rate_intervals(_stopped_within(trace, way, trace.exact, tolerance)[None])[0]
 
 
 def _warnings(trace: Trace, agent: Agent, objects: list[Any], condition: str) -> dict[str, str]:
@@ -415,10 +406,10 @@ def _warnings(trace: Trace, agent: Agent, objects: list[Any], condition: str) ->
     return warnings
 
 
-def _in_air(trace: Trace, way: Way, unit: Unit) -> InAir:
+def _in_air(trace: Trace, way: Way) -> InAir:
     first = trace.reached > 0
     in_a_row = trace.reached == trace.schedule.most
-    shares = rate_intervals(np.stack([trace.given, in_a_row]), unit)
+    shares = rate_intervals(np.stack([trace.given, in_a_row]))
     return InAir(
         held=shares[0],
         first=share_among(first, trace.given),
@@ -430,23 +421,22 @@ def _in_air(trace: Trace, way: Way, unit: Unit) -> InAir:
 
 def _consecutive(trace: Trace, names: Sequence[str]) -> tuple[Consecutive, ...]:
     """Of all objects, and of each."""
-    counts = [_consecutive_of("all", trace)]
-    for k, name in enumerate(names):
-        counts.append(_consecutive_of(name, trace.of([k])))
+    parts = {"all": trace} | {name: trace.of([k]) for k, name in enumerate(names)}
+    counts = []
+    for name, part in parts.items():
+        reached = part.reached
+        full = reached == part.schedule.most
+        counts.append(
+            Consecutive(
+                name,
+                mean=float(reached.mean()),
+                median=float(np.median(reached)),
+                goals=float(reached.sum() / (reached.sum() + (~full).sum())),
+                lost=float((part.fell & ~full).mean()),
+                full=float(full.mean()),
+            )
+        )
     return tuple(counts)
-
-
-def _consecutive_of(name: str, trace: Trace) -> Consecutive:
-    reached = trace.reached
-    full = reached == trace.schedule.most
-    return Consecutive(
-        name,
-        mean=float(reached.mean()),
-        median=float(np.median(reached)),
-        goals=float(reached.sum() / (reached.sum() + (~full).sum())),
-        lost=float((trace.fell & ~full).mean()),
-        full=float(full.mean()),
-    )
 
 
 def summarise(
@@ -454,7 +444,6 @@ def summarise(
     episodes: tuple[Episode, ...],
     alike: np.ndarray,
     protocol: Protocol,
-    unit: Unit,
 ) -> Summary:
     """Every rate, median and interval of some episodes, whole objects of them.
 
@@ -464,16 +453,16 @@ def summarise(
     errors = np.where(fell, np.pi, _column(episodes, protocol, "exact_error_rad"))
     outcomes = _outcomes(episodes, protocol)
     within = [errors <= tolerance for tolerance in TOLERANCES_RAD]
-    rates = rate_intervals(np.stack([*outcomes, *within, alike]), unit)
+    rates = rate_intervals(np.stack([*outcomes, *within, alike]))
     times = _column(episodes, protocol, "steps")[outcomes[0]] / protocol.control_hz
     return Summary(
         name=name,
         episodes=len(episodes),
-        unit=unit,
+        unit=choose_unit(len(errors)),
         outcomes=dict(zip(OUTCOMES, rates, strict=False)),
         success=dict(zip(map(str, TOLERANCES_RAD), rates[len(OUTCOMES) :], strict=False)),
         symmetric=rates[-1],
-        median_error_rad=median_interval(errors, unit),
+        median_error_rad=median_interval(errors),
         time_s=order_interval(times) if times.size else None,
     )
 
@@ -491,11 +480,9 @@ def _outcomes(episodes: tuple[Episode, ...], protocol: Protocol) -> np.ndarray:
     return np.stack([stopped & right, stopped & ~right, ~stopped & ~fell, ~stopped & fell])
 
 
-def _stopped_within(
-    trace: Trace, rule: StoppingRule, by: StopsBy, error: np.ndarray, bound_rad: float
-) -> np.ndarray:
-    """Which episodes a rule stops within a bound of an error, one of the trace's, bool [K, M]."""
-    steps, stopped = trace.ends(rule, by)
+def _stopped_within(trace: Trace, way: Way, error: np.ndarray, bound_rad: float) -> np.ndarray:
+    """Which episodes a way stops within a bound of an error, one of the trace's, bool [K, M]."""
+    steps, stopped = trace.ends(*way)
     return np.asarray(stopped & (at_steps(error, steps) <= bound_rad))
 
 

@@ -28,7 +28,7 @@ def draw_starts_and_goals(
 
 
 def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: float) -> np.ndarray:
-    """Orientations uniform on SO(3) within ``max_goal_angle`` [rad] of ``start``, quaternions xyzw [n, 4]."""
+    """Orientations xyzw [n, 4], uniform on SO(3) within ``max_goal_angle`` [rad] of ``start``."""
     axis = rng.normal(size=(len(start), 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     # The angle of a uniform rotation has density (1 - cos)/pi: invert its cumulative distribution.
@@ -43,7 +43,10 @@ def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: floa
 def draw_turns(
     names: Sequence[str], episodes: int, most: int, *, seed: int, max_goal_angle: float
 ) -> np.ndarray:
-    """Rotations from where objects are to their goals in a row [K, M, most, 4], by name, seed and episode."""
+    """Rotations from where objects are to their goals in a row [K, M, most, 4].
+
+    They depend on name, seed and episode.
+    """
     turns = []
     for name in names:
         rng = np.random.default_rng([seed, zlib.crc32(name.encode()), most])

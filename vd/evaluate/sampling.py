@@ -59,8 +59,8 @@ class SamplingController:
         """Build the model.
 
         Args:
-            env: What is controlled: N environments, a multiple of the number of objects, so that the
-                model's blocks of ``samples`` hold the same objects. The model is nominal.
+            env: What is controlled: N environments, a multiple of the number of objects, so that
+                the model's blocks of ``samples`` hold the same objects. The model is nominal.
             cfg: Sizes.
             policy: A teacher that proposes half of the futures; None: all are about the plan.
             seed: Of the noise.
@@ -122,7 +122,7 @@ class SamplingController:
         self._model.sim.forward_kinematics()
 
     def _noise(self) -> torch.Tensor:
-        """Noise of standard deviation 1, smooth in time, shape [N, S, H, A]; that of the first is 0."""
+        """Noise of standard deviation 1, smooth in time [N, S, H, A]; that of the first is 0."""
         cfg = self.cfg
         envs = self._env.num_envs
         knots = torch.randn(

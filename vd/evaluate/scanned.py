@@ -44,12 +44,12 @@ def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> Objec
 
     The surface through them, and its samples.
     """
-    vertices, faces = surface_of_scan(points, device)
-    samples = surface_points(vertices, faces, len(item.surface_points))
+    surface = surface_of_scan(points, device)
+    samples = surface_points(surface, len(item.surface_points))
     return replace(
         item,
-        vertices=vertices.astype(np.float32),
-        faces=faces,
+        vertices=surface.vertices.astype(np.float32),
+        faces=surface.faces,
         surface_points=samples.astype(np.float32),
     )
 

@@ -21,6 +21,8 @@ import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
+from vd.geometry.quaternions import product, rotation_distance
+
 Unit = Literal["object", "episode"]
 
 CONFIDENCE = 0.95
@@ -42,26 +44,6 @@ class Interval:
     gave the bounds."""
 
 
-def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between two rotations in [0, pi], quaternions xyzw [..., 4], broadcast."""
-    # |a - b| and |a + b| stay exact for small angles, where the arc cosine of a dot product does
-    # not.
-    minus = np.linalg.norm(a - b, axis=-1)
-    plus = np.linalg.norm(a + b, axis=-1)
-    return 4.0 * np.arctan2(np.minimum(minus, plus), np.maximum(minus, plus))
-
-
-def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product ``a b`` of quaternions xyzw, shapes [..., 4], broadcast."""
-    a_vector = a[..., :3]
-    a_scalar = a[..., 3:]
-    b_vector = b[..., :3]
-    b_scalar = b[..., 3:]
-    vector = a_scalar * b_vector + b_scalar * a_vector + np.cross(a_vector, b_vector)
-    scalar = a_scalar * b_scalar - np.sum(a_vector * b_vector, axis=-1, keepdims=True)
-    return np.concatenate([vector, scalar], axis=-1)
-
-
 def symmetric_error(
     object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np.ndarray
 ) -> np.ndarray:
@@ -72,8 +54,8 @@ def symmetric_error(
         goal_quat: Goal orientations xyzw, shape [..., 4].
         symmetry: The rotations of the object onto itself, body frame, xyzw, shape [S, 4].
     """
-    turned = quat_multiply(np.asarray(object_quat)[..., None, :], np.asarray(symmetry))
-    return rotation_angle(turned, np.asarray(goal_quat)[..., None, :]).min(axis=-1)
+    turned = product(object_quat[..., None, :], symmetry)
+    return np.asarray(rotation_distance(turned, goal_quat[..., None, :]).min(axis=-1))
 
 
 def choose_unit(num_objects: int) -> Unit:
@@ -86,9 +68,12 @@ def share_among(of: np.ndarray, among: np.ndarray) -> float | None:
     return float(of[among].mean()) if among.any() else None
 
 
-def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
-    """How much larger the rate of some outcomes is than that of others on the same episodes, bool [K, M]."""
+def paired_difference(
+    outcomes: np.ndarray, others: np.ndarray, unit: Unit | None = None
+) -> Interval:
+    """How much larger the rate of outcomes is than that of others on the same episodes [K, M]."""
     pairs = outcomes.astype(float) - others
+    unit = unit or choose_unit(len(pairs))
     units = pairs.mean(axis=1)[None] if unit == "object" or pairs.shape[1] == 1 else pairs
     strata, n = units.shape
     half = np.inf
@@ -99,7 +84,7 @@ def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> I
     return Interval(mean, max(mean - half, -1.0), min(mean + half, 1.0), "paired-t")
 
 
-def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
+def rate_intervals(outcomes: np.ndarray, unit: Unit | None = None) -> list[Interval]:
     """Rates of yes/no outcomes with 95 % intervals.
 
     Where all units are equal (no success at all, say), nothing is known of how they differ, and the
@@ -107,10 +92,10 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
 
     Args:
         outcomes: Booleans, or shares in [0, 1], shape [R, K, M] for R rates.
-        unit: What the statement is about.
+        unit: What the statement is about; by default as :func:`choose_unit` says.
     """
     outcomes = np.asarray(outcomes, dtype=float)
-    lows, highs = _logit_t(outcomes, unit)
+    lows, highs = _logit_t(outcomes, unit or choose_unit(outcomes.shape[1]))
     intervals = []
     for group, low, high in zip(outcomes, lows, highs, strict=True):
         rate = float(group.mean())
@@ -152,7 +137,7 @@ def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
     return expit(odds(total) - half), expit(odds(total) + half)
 
 
-def median_interval(values: np.ndarray, unit: Unit) -> Interval:
+def median_interval(values: np.ndarray, unit: Unit | None = None) -> Interval:
     """Median of finite values [K, M] with its 95 % interval."""
     values = np.asarray(values, dtype=float)
     median = float(np.median(values))

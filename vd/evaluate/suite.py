@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 from vd.command.config import from_dict
-from vd.paper import PAPER
 
 FOLDER = Path(__file__).with_name("suites")
 """Where the suites are that have a name."""
@@ -65,21 +64,6 @@ class Claim:
     stopped_by: str | None = None
     """Whose rule; None: that of each policy."""
 
-    def paper_text(self) -> str:
-        """What the paper says: ``96 % (94 to 97)``, ``0.12 to 0.13``, ``below 7``.
-
-        Empty: nothing.
-        """
-        if self.paper is None:
-            return ""
-        values: tuple[float, ...] = getattr(PAPER.results, self.paper)
-        if self.unit == "share":
-            return share_text(*values)
-        if self.unit == "rad":
-            low, high = values
-            return f"{low:.2f} to {high:.2f}"
-        return f"below {values[0]:g}"
-
 
 @dataclass(frozen=True)
 class Suite:
@@ -92,16 +76,6 @@ class Suite:
     """By group of objects the names of those that it takes of its sets; others take all."""
     by_aspect: bool = False
     """Whether its figures are by aspect ratio of the objects too."""
-
-
-def share_text(value: float, *interval: float) -> str:
-    """``85 % (82 to 88)``, with a decimal where whole per cents would hide how small it is."""
-    digits = 0 if interval and value >= 0.1 else 1
-    text = f"{100.0 * value:.{digits}f} %"
-    if interval:
-        low, high = interval
-        text = f"{text} ({100.0 * low:.{digits}f} to {100.0 * high:.{digits}f})"
-    return text
 
 
 def read_suite(name: str) -> Suite:

@@ -29,7 +29,16 @@ from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.claims import claimed
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
-from vd.evaluate.page import NOTHING, labels, number, points, shortened, shown_name, write_page
+from vd.evaluate.page import (
+    NOTHING,
+    labels,
+    number,
+    percent,
+    points,
+    shortened,
+    shown_name,
+    write_page,
+)
 from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
@@ -37,11 +46,12 @@ from vd.evaluate.suite import (
     QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
+    Claim,
     Suite,
     SuiteEntry,
     read_suite,
-    share_text,
 )
+from vd.paper import PAPER
 from vd.policy.agents import find_policy, has_no_file, open_policy, sees_clouds
 
 SETTINGS_FILE = "settings.json"
@@ -408,54 +418,51 @@ def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str
             change = NOTHING
             if entry.name != first and (first, policy) in row_of and row.in_air is None:
                 nominal = row_of[first, policy]
-                difference = paired_difference(row.successes, nominal.successes, row.overall.unit)
+                difference = paired_difference(row.successes, nominal.successes)
                 change = points(difference)
             table.append(
                 {
                     "condition": entry.name,
                     "changed": shown(entry),
                     "policy": policy,
-                    "success": _share(row.overall.outcomes["success"]),
+                    "success": percent(row.overall.outcomes["success"]),
                     f"points from {first}": change,
-                    "within 0.1 rad": _share(row.precise),
-                    "lost": _share(row.overall.outcomes["object falls"]),
+                    "within 0.1 rad": percent(row.precise),
+                    "lost": percent(row.overall.outcomes["object falls"]),
                 }
             )
     return table
 
 
 def aspect_table(result: Result, groups: dict[str, ObjectGroup]) -> list[dict[str, str]]:
-    """A line for each entry and policy: success of all objects, and of each class of aspect ratio."""
+    """A line for each entry and policy: success of all objects, and of each class of aspect ratio.
+
+    It is the longest by the shortest extent of an object along its principal axes.
+    """
+    from vd.assets_usd.objects.geometry import sides_along_axes
     from vd.assets_usd.objects.sets import load_set
 
     aspects: dict[tuple[str, str], float] = {}
     for name, group in groups.items():
         for item in load_set(group.sets):
-            aspects[name, item.name] = aspect_ratio(item.surface_points)
+            extents = sides_along_axes(item.surface_points)
+            aspects[name, item.name] = float(extents.max() / extents.min())
     table = []
     for row in result.rows:
         if not row.headline:
             continue
         line = {"condition": row.condition, "policy": row.policy}
-        line["success"] = _share(row.overall.outcomes["success"])
+        line["success"] = percent(row.overall.outcomes["success"])
         for low, high in pairwise(ASPECTS):
             rates = [
                 item.outcomes["success"].value
                 for item in row.per_object
                 if low <= aspects[row.group, item.name] < high
             ]
-            mean = share_text(float(np.mean(rates))) if rates else NOTHING
+            mean = percent(float(np.mean(rates))) if rates else NOTHING
             line[f"aspect {low:g} to {high:g}"] = f"{mean} of {len(rates)}" if rates else mean
         table.append(line)
     return table
-
-
-def aspect_ratio(points: np.ndarray) -> float:
-    """Longest by shortest extent of points [P, 3] along their principal axes."""
-    centred = points - points.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2]
-    extents = np.ptp(centred @ axes.T, axis=0)
-    return float(extents.max() / extents.min())
 
 
 def paper_figures(result: Result, suite: Suite) -> list[dict[str, str]]:
@@ -468,20 +475,28 @@ def paper_figures(result: Result, suite: Suite) -> list[dict[str, str]]:
             figure = {
                 "figure": claim.text,
                 "condition": entry.name,
-                "paper": claim.paper_text() or NOTHING,
+                "paper": paper_text(claim),
             }
             for policy in result.policies:
                 rows = [r for r in result.rows if (r.condition, r.policy) == (entry.name, policy)]
                 value = claimed(claim, rows)
                 in_unit = claim.unit != "share" and isinstance(value, Interval)
-                figure[policy] = number(value) if in_unit else _share(value)
+                figure[policy] = number(value) if in_unit else percent(value)
             figures.append(figure)
     return figures
 
 
-def _share(rate: Interval | float | None) -> str:
-    if rate is None:
+def paper_text(claim: Claim) -> str:
+    """What the paper says: ``96.0 % (94.0 to 97.0)``, ``0.12 to 0.13``, ``below 7``."""
+    if claim.paper is None:
         return NOTHING
-    if isinstance(rate, Interval):
-        return share_text(rate.value, rate.low, rate.high)
-    return share_text(rate)
+    values: tuple[float, ...] = getattr(PAPER.results, claim.paper)
+    if claim.unit == "rad":
+        low, high = values
+        return f"{low:.2f} to {high:.2f}"
+    if claim.unit == "s":
+        return f"below {values[0]:g}"
+    if len(values) == 1:
+        return percent(values[0])
+    value, low, high = values
+    return percent(Interval(value, low, high, ""))

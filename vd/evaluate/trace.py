@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from vd.evaluate.goals import ONE_GOAL, GoalSchedule
 from vd.evaluate.rollout import episode_rounds, unit_quats
-from vd.evaluate.statistics import rotation_angle, symmetric_error
+from vd.evaluate.statistics import symmetric_error
+from vd.geometry.quaternions import rotation_distance
 from vd.paper import PAPER
 from vd.policy.stopping import StoppingRule
 
@@ -233,7 +234,7 @@ def record(
 def drawn_rounds(
     env: "ReorientEnv", episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
-    """Episode number of each environment, -1 for none [N], and its state at the begin, for every round."""
+    """For every round the environments' episode numbers, -1 for none [N], and first state."""
     world_object = np.asarray(env.world_object)
     drawn = []
     for numbers in episode_rounds(world_object, len(env.objects), episodes):
@@ -267,7 +268,7 @@ def copy_motion(
 
 
 def act_in(env: "ReorientEnv", policy: Any, envs: np.ndarray) -> torch.Tensor:
-    """Actions [N, D]; a policy with ``predicted`` is told that it need not act but in some environments."""
+    """Actions [N, D]; a policy with ``predicted`` is told that only some environments matter."""
     if hasattr(policy, "predicted"):
         policy.active = torch.zeros_like(policy.predicted, dtype=torch.bool)
         policy.active[torch.from_numpy(envs).to(policy.active.device)] = True
@@ -380,7 +381,7 @@ class _Round:
         return envs[self._trace.reached[self._place(envs)] == 0]
 
     def _begin(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
-        """Write down where the first goal begins, ``quat`` [N, 4] being the objects' orientations."""
+        """Write down where the first goal begins; ``quat`` [N, 4] are the objects' orientations."""
         self._trace.start_quat[self._place(envs)] = quat[envs]
         self._trace.goal_quat[self._place(envs)] = self._goal[envs]
         self._write_errors(envs, step, quat)
@@ -401,7 +402,7 @@ class _Round:
     def _write_errors(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
         """Write the errors of environments after ``step`` steps."""
         trace = self._trace
-        self._exact[envs] = rotation_angle(quat[envs], self._goal[envs])
+        self._exact[envs] = rotation_distance(quat[envs], self._goal[envs])
         envs = self._at_first(envs)
         if not len(envs):
             return
@@ -478,5 +479,5 @@ class _Round:
             copy_motion(live, state, np.flatnonzero(away))  # or it would fall for half a minute
         place = self._place(envs)
         quat = unit_quats(env.object_pose()[envs, 3:7])
-        error = rotation_angle(quat, self._trace.goal_quat[place])
+        error = rotation_distance(quat, self._trace.goal_quat[place])
         self._trace.held[way][place] = np.where(lost[envs], np.pi, error)

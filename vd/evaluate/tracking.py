@@ -6,7 +6,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.assets_usd.hand_data import CameraModel
 from vd.evaluate.goals import Goals
 from vd.evaluate.scanned import known_objects
 from vd.policy.senses import Senses
@@ -44,32 +43,6 @@ def sensed_with(env: "ReorientEnv", points: torch.Tensor) -> Senses:
     )
 
 
-def acting_in(
-    env: "ReorientEnv", policy: AnyCameraPolicy, camera: CameraModel, *, goals: Goals, seed: int
-) -> Tracker | ActingStudent:
-    """A camera policy on the hands of an environment; arguments as of :class:`CameraActor`."""
-    objects = known_objects(
-        env.objects, goals, seed=seed, device=env.device, surfaces=policy.kind == "tracking"
-    )
-    scene = env.scene
-    if isinstance(policy, StudentPolicy):
-        clouds = np.stack([item.surface_points for item in objects])[scene.world_object]
-        scaled = clouds * np.asarray(scene.world_scale)[:, None, None]
-        place = str(wp.device_to_torch(env.device))
-        policy.network.half = place.startswith("cuda")
-        goal_clouds = torch.tensor(scaled, dtype=torch.float32, device=place)
-        return ActingStudent(policy.network, env.hand, goal_clouds)
-    return Tracker(
-        policy,
-        env.hand,
-        objects,
-        camera,
-        world_object=scene.world_object,
-        world_scale=scene.world_scale,
-        device=env.device,
-    )
-
-
 class CameraActor:
     """A policy that sees by a camera in every environment of an environment.
 
@@ -81,7 +54,6 @@ class CameraActor:
         seed: Of these, and of scans.
 
     Attributes:
-        num_actions: D.
         hand: The hand.
         camera: A depth camera in every environment.
         tracker: What decides.
@@ -99,7 +71,6 @@ class CameraActor:
         seed: int = 0,
     ):
         self.hand = env.hand
-        self.num_actions = policy.num_actions
         self._env = env
         self._surfaces = [item.surface_points for item in env.objects]
         # Who sees by a camera acts in the world, whatever its teacher does.
@@ -114,13 +85,32 @@ class CameraActor:
             frame_s=env.cfg.sim.control_dt,
             seed=seed,
         )
-        self.tracker = acting_in(env, policy, camera, goals=goals, seed=seed)
         place = wp.device_to_torch(env.device)
+        known = known_objects(
+            env.objects, goals, seed=seed, device=env.device, surfaces=policy.kind == "tracking"
+        )
+        self.tracker: Tracker | ActingStudent
+        if isinstance(policy, StudentPolicy):
+            clouds = np.stack([item.surface_points for item in known])[env.scene.world_object]
+            scaled = clouds * np.asarray(env.scene.world_scale)[:, None, None]
+            policy.network.half = place.startswith("cuda")
+            goal_clouds = torch.tensor(scaled, dtype=torch.float32, device=place)
+            self.tracker = ActingStudent(policy.network, env.hand, goal_clouds)
+        else:
+            self.tracker = Tracker(
+                policy,
+                env.hand,
+                known,
+                camera,
+                world_object=env.scene.world_object,
+                world_scale=env.scene.world_scale,
+                device=env.device,
+            )
         self.predicted = torch.zeros(env.num_envs, device=place)
         self.active = torch.ones(env.num_envs, dtype=torch.bool, device=place)
 
     def surface(self, world: int) -> np.ndarray:
-        """Points on the surface of an environment's object, in the frame that is found [m] [P, 3]."""
+        """Surface points of an environment's object, in the frame that is found [m] [P, 3]."""
         scene = self._env.scene
         return self._surfaces[scene.world_object[world]] * scene.world_scale[world]
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.command.files import atomic_path, write_json
 from vd.logs.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_header, read_table
-from vd.logs.recording_checks import RecordingError
+from vd.logs.recording_checks import RecordingError, require
 
 Kind = Literal["drop", "slide", "push", "press"]
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -80,17 +80,17 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
     header = read_header(file)
-    if header.get("model") != CONTACT_MODEL:
-        raise RecordingError(
-            f"{file}: model must be {CONTACT_MODEL!r}; recordings of joints are for vd-gap run"
-        )
+    require(
+        header.get("model") == CONTACT_MODEL,
+        f"{file}: model must be {CONTACT_MODEL!r}; recordings of joints are for vd-gap run",
+    )
     table = _frame(file, "table_pose", header)
     tracked = _frame(file, "object_pose", header)
-    entries = header.get("trajectories")
-    if not isinstance(entries, list) or not entries:
-        raise RecordingError(
-            f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}"
-        )
+    entries = header.get("trajectories", [])
+    require(
+        bool(entries) and isinstance(entries, list),
+        f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}",
+    )
     motions: dict[str, ContactMotion] = {}
     for i, entry in enumerate(entries):
         where = f"{file}: trajectories[{i}]"
@@ -102,8 +102,10 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
             raise RecordingError(
                 f"{where}: give 'file', and 'excitation' out of {', '.join(NEEDED)}"
             ) from error
-        if name.name in motions or name.name != str(name):
-            raise RecordingError(f"{where}: list '{name}' once, a file of this folder")
+        require(
+            name.name == str(name) and name.name not in motions,
+            f"{where}: list '{name}' once, a file of this folder",
+        )
         motions[name.name] = _motion(file.parent / name, kind, table, tracked)
     return ContactRecording(file.parent, tuple(motions.values()))
 
@@ -147,17 +149,37 @@ def _motion(
     table_frame: tuple[np.ndarray, Rotation],
     object_frame: tuple[np.ndarray, Rotation],
 ) -> ContactMotion:
-    columns = _columns(file, kind)
-    time = columns["t"]
-    pose = _vectors(columns, POSE)
+    names, rows = read_table(file)
+    for name in NEEDED[kind]:
+        require(
+            names.count(name) == 1,
+            f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it",
+        )
+    require(
+        len(rows) >= MIN_SAMPLES,
+        f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again",
+    )
+
+    def vectors(wanted: tuple[str, ...]) -> np.ndarray:
+        """Columns side by side [T, n], or empty [0, 3] where they were not recorded."""
+        if not set(wanted) <= set(names):
+            return np.empty((0, 3))
+        columns = []
+        for name in wanted:
+            place = names.index(name)
+            columns.append(numbers(file, name, [row[place] for row in rows]))
+        return np.stack(columns, axis=1)
+
+    time = vectors(("t",))[:, 0]
+    pose = vectors(POSE)
     _check_values(file, time, pose)
     origin, table = table_frame
     offset, turn = object_frame
     to_table = table.inv()
     tracked = Rotation.from_quat(pose[:, 3:])
     position = pose[:, :3] + tracked.apply(offset)
-    pusher = _vectors(columns, PUSHER)
-    force = _vectors(columns, FORCE)
+    pusher = vectors(PUSHER)
+    force = vectors(FORCE)
     if len(pusher):
         pusher = to_table.apply(pusher - origin)
     if len(force):
@@ -173,32 +195,6 @@ def _motion(
     )
 
 
-def _vectors(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
-    """Columns side by side [T, n], or empty [0, 3] where they were not recorded."""
-    if not columns.keys() >= set(names):
-        return np.empty((0, 3))
-    return np.stack([columns[name] for name in names], axis=1)
-
-
-def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
-    """The columns of a CSV file by name, all of them finite numbers."""
-    names, rows = read_table(file)
-    for name in NEEDED[kind]:
-        if names.count(name) != 1:
-            raise RecordingError(
-                f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it"
-            )
-    if len(rows) < MIN_SAMPLES:
-        raise RecordingError(
-            f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again"
-        )
-    columns = {}
-    for i, name in enumerate(names):
-        if name in NEEDED["press"]:
-            columns[name] = numbers(file, name, [row[i] for row in rows])
-    return columns
-
-
 def _check_values(file: Path, time: np.ndarray, pose: np.ndarray) -> None:
     """Time increases, positions are in metres, quaternions are some."""
     lengths = np.linalg.norm(pose[:, 3:], axis=1)
@@ -211,5 +207,5 @@ def _check_values(file: Path, time: np.ndarray, pose: np.ndarray) -> None:
         ),
         ("qx", np.abs(lengths - 1.0) > UNIT_ERROR, "quaternions have length 1"),
     ):
-        if wrong.any():
-            raise RecordingError(f"{file}: row {wrong.argmax() + 2}, column {column!r}: {remedy}")
+        row = wrong.argmax() + 2
+        require(not wrong.any(), f"{file}: row {row}, column {column!r}: {remedy}")

@@ -8,6 +8,7 @@ Commands are in rad, times in seconds.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -108,6 +109,7 @@ def _time(duration_s: float) -> np.ndarray:
     return np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
 
 
+_LADDER = (_levels("ladder_step", 1.75, 0.4, -0.2), _sine("ladder_sine", 0.4, 5.0))
 MENU: dict[str, tuple[MenuMotion, ...]] = {
     "steps_and_sines": (
         _levels("step_small", 1.75, 0.12, -0.12),
@@ -123,9 +125,7 @@ MENU: dict[str, tuple[MenuMotion, ...]] = {
     "slow_triangle": (_triangle("slow_triangle", 16.0, 20.0),),
     # Steps and sines at falling P gains: what scales with the gain is the servo's.
     "gain_ladder": tuple(
-        replace(motion, gain=gain)
-        for gain in (1.0, 0.5, 0.25)
-        for motion in (_levels("ladder_step", 1.75, 0.4, -0.2), _sine("ladder_sine", 0.4, 5.0))
+        replace(motion, gain=gain) for gain, motion in product((1.0, 0.5, 0.25), _LADDER)
     ),
     # The same sine with two payloads: what grows with the load.
     "second_payload": tuple(replace(_sine("payload_sine", 0.25, 8.0), payload=i) for i in (0, 1)),
@@ -150,7 +150,9 @@ MENU: dict[str, tuple[MenuMotion, ...]] = {
 def excitation_set(
     reach: JointRange, names: Sequence[str] = ("steps_and_sines",)
 ) -> list[Trajectory]:
-    """The motions of several sets, in order, joint by joint, with their commands in the place of positions.
+    """The motions of several sets, in order, joint by joint.
+
+    Their commands stand in the place of positions.
 
     Args:
         reach: Joints and limits.
@@ -162,5 +164,8 @@ def excitation_set(
     for name in names:
         if name not in MENU:
             raise ValueError(f"unknown excitation {name!r}; choose from {', '.join(MENU)}")
-    joints = range(len(reach.joints))
-    return [motion.of(reach, joint) for name in names for joint in joints for motion in MENU[name]]
+    motions = []
+    for name in names:
+        for joint in range(len(reach.joints)):
+            motions += [motion.of(reach, joint) for motion in MENU[name]]
+    return motions

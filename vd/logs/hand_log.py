@@ -4,9 +4,9 @@ Written by vd-deploy as it goes, replayed by vd-play, read by vd-gap.
 
 A folder. ``steps.csv`` has a row for every control step, appended whole, so that a log cut short by
 a crash is a log. ``recording.json`` beside it makes the folder a recording
-(:mod:`vd.logs.recording`). ``run.json`` says what ran, and at the end how it ended; ``events.jsonl``
-has goals, stops and faults. SI units, radians, world frame, quaternions xyzw; times are seconds
-since the start. A row is a state, read at ``t``, and the goals that were sent after it, at
+(:mod:`vd.logs.recording`). ``run.json`` says what ran, and at the end how it ended;
+``events.jsonl`` has goals, stops and faults. SI units, radians, world frame, quaternions xyzw;
+times are seconds since the start. A row is a state, read at ``t``, and the goals that were sent after it, at
 ``t_command``.
 """
 
@@ -91,7 +91,7 @@ class HandLog:
 
     @property
     def stopped(self) -> tuple[str, dict[str, str]] | None:
-        """Why the hand was stopped, and motors that may be on, by ID; None where nobody noted it."""
+        """Why the hand was stopped, and motors that may be on, by ID; None where it is unknown."""
         for event in reversed(self.events):
             if event["event"] == STOPPED:
                 return event["reason"], event["may_be_on"]
@@ -165,7 +165,7 @@ def read_columns(file: Path) -> dict[str, np.ndarray]:
         for number, row in enumerate(rows, 2):
             if len(row) != len(header):
                 raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
-        values = np.array([[float(cell) for cell in row] for row in rows])
+        values = np.array(rows, dtype=float)
     except ValueError as error:
         raise LogError(f"{file} is damaged ({error}); copy the whole folder again") from error
     if not rows:

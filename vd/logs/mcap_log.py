@@ -1,7 +1,7 @@
 """The log of a run in one MCAP file of ROS 2 messages, for Foxglove, PlotJuggler and ``ros2 bag``.
 
-Topics are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose`` (as the
-policy finds it), ``/goal_pose``, ``/depth`` [mm] and ``/events``. Needs the extra ``log``.
+Topics are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose`` (as
+the policy finds it), ``/goal_pose``, ``/depth`` [mm] and ``/events``. Needs the extra ``log``.
 """
 
 import json
@@ -15,29 +15,10 @@ from vd.logs.log_format import FOUND_COLUMNS, TRUTH_COLUMNS
 
 WORLD = "world"
 _NS = 1_000_000_000
-_TIME = "int32 sec\nuint32 nanosec"
-_HEADER = "builtin_interfaces/Time stamp\nstring frame_id"
-_XYZ = "float64 x\nfloat64 y\nfloat64 z"
-_PARTS = {
-    "std_msgs/Header": _HEADER,
-    "builtin_interfaces/Time": _TIME,
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/Point": _XYZ,
-    "geometry_msgs/Quaternion": f"{_XYZ}\nfloat64 w",
-}
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
 IMAGE = "sensor_msgs/msg/Image"
 TEXT = "std_msgs/msg/String"
-_TYPES = {
-    JOINT_STATE: "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
-    "float64[] velocity\nfloat64[] effort",
-    POSE: "std_msgs/Header header\ngeometry_msgs/Pose pose",
-    IMAGE: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n"
-    "uint8 is_bigendian\nuint32 step\nuint8[] data",
-    TEXT: "string data",
-}
-"""Definitions of the messages, which the file has."""
 
 
 class McapLog:
@@ -56,18 +37,21 @@ class McapLog:
 
     def __init__(self, path: Path, run: Mapping[str, Any], place: np.ndarray):
         from mcap_ros2.writer import Writer
+        from rosbags.typesys import Stores, get_typestore
 
         self._file: IO[bytes] = path.open("xb")
         self._writer = Writer(self._file)
         self._schemas = {}
-        for name, text in _TYPES.items():
-            self._schemas[name] = self._writer.register_msgdef(name, _definition(text))
+        types = get_typestore(Stores.LATEST)
+        for name in (JOINT_STATE, POSE, IMAGE, TEXT):
+            text, _ = types.generate_msgdef(name, ros_version=2)
+            self._schemas[name] = self._writer.register_msgdef(name, text)
         self._run = dict(run)
         self._place = place
         self._joints = list(run["joints"])
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
-        """Write a control step, by columns of steps.csv, and the depth image [m] [H, W] that it saw."""
+        """Write a control step, by columns of steps.csv, and the depth image it saw [m] [H, W]."""
         t = row["t"]
         self._write_joints(t, "/joint_states", row, "position", "velocity")
         self._write_joints(row["t_command"], "/joint_commands", row, "command")
@@ -128,18 +112,6 @@ class McapLog:
     def _write(self, t: float, topic: str, kind: str, /, **fields: Any) -> None:
         """A message of a time since the begin [s]."""
         ns = round(_NS * (self._run["unix_s"] + t))
-        if "Header" in _TYPES[kind]:
+        if kind != TEXT:
             fields["header"] = {"stamp": {"sec": ns // _NS, "nanosec": ns % _NS}, "frame_id": WORLD}
         self._writer.write_message(topic, self._schemas[kind], fields, log_time=ns)
-
-
-def _definition(text: str) -> str:
-    """A message's definition with those of what it is made of, as MCAP wants it."""
-    parts = {"": text}
-    waiting = [text]
-    while waiting:
-        for name in waiting.pop().split():
-            if name in _PARTS and name not in parts:
-                parts[name] = f"{80 * '='}\nMSG: {name}\n{_PARTS[name]}"
-                waiting.append(_PARTS[name])
-    return "\n".join(parts.values())

@@ -69,7 +69,7 @@ class Trajectory:
         return float(self.time[-1])
 
     def piece(self, first: int, end: int) -> "Trajectory":
-        """Samples ``first`` to ``end`` (not included), with the times that they have in the whole."""
+        """Samples ``first`` to ``end`` (not included), with their times in the whole."""
         arrays = {name: getattr(self, name) for name in ("time", "command_time", *CHANNELS)}
         return replace(self, **{name: a[first:end] for name, a in arrays.items() if a is not None})
 

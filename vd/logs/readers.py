@@ -2,7 +2,8 @@
 
 LeRobot datasets, ROS bags and MCAP, BAM's logs, CSV with units.
 
-Every reader yields a :class:`SourceMotion` for each episode, bag or file. ``FORMATS`` has them by name.
+Every reader yields a :class:`SourceMotion` for each episode, bag or file. ``FORMATS`` has them by
+name.
 """
 
 import json
@@ -16,7 +17,7 @@ import numpy as np
 
 from vd.command.interrupt import need
 from vd.logs.recording import by_channel, numbers, read_table
-from vd.logs.recording_checks import RecordingError
+from vd.logs.recording_checks import RecordingError, require
 
 ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 UNITS: dict[str, Mapping[str, float]] = {
@@ -119,16 +120,17 @@ def read_csv(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
             name, scale = _column(file, text, options)
             if scale is None:
                 continue
-            if name in columns:
-                raise RecordingError(f"{file}: two columns are {name!r}; --rename one to 'unused'")
+            require(
+                name not in columns, f"{file}: two columns are {name!r}; --rename one to 'unused'"
+            )
             columns[name] = scale * numbers(file, text, [row[i] for row in rows])
             _, dot, joint = name.partition(".")
             if dot:
                 joints[joint] = None
-        if "t" not in columns:
-            raise RecordingError(
-                f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'"
-            )
+        require(
+            "t" in columns,
+            f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'",
+        )
         channels = by_channel(columns, tuple(joints), len(rows))
         yield SourceMotion(file.stem, tuple(joints), columns["t"], channels)
 
@@ -146,11 +148,11 @@ def _column(file: Path, text: str, options: ReaderOptions) -> tuple[str, float |
         unit = options.unit or ""
     elif not unit and len(units) == 1:
         (unit,) = units
-    if unit not in units:
-        problem = f"has the unit {unit!r}" if unit else "has no unit"
-        raise RecordingError(
-            f"{file}: column {text!r} {problem}; write '{name} [{'] or ['.join(units)}]'"
-        )
+    problem = f"has the unit {unit!r}" if unit else "has no unit"
+    require(
+        unit in units,
+        f"{file}: column {text!r} {problem}; write '{name} [{'] or ['.join(units)}]'",
+    )
     return name, units[unit]
 
 
@@ -210,10 +212,10 @@ def read_lerobot(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
             "normalised to -100 to 100 are no angles: record with use_degrees=True"
         )
     joints = [joint for joint in measured if joint in commanded]
-    if not joints:
-        raise RecordingError(
-            f"{info}: 'action' has {commanded}, 'observation.state' {measured}: none in both"
-        )
+    require(
+        bool(joints),
+        f"{info}: 'action' has {commanded}, 'observation.state' {measured}: none in both",
+    )
     columns = _lerobot_columns(path)
     scale = ANGLES[options.unit]
     command = scale * _lerobot_joints(path, columns["action"], commanded, joints)
@@ -239,10 +241,10 @@ def _lerobot_columns(path: Path) -> dict[str, np.ndarray]:
         raise RecordingError(
             f"{path}: data/**/*.parquet cannot be read ({error}); download the data again"
         ) from error
-    if not len(columns["timestamp"]):
-        raise RecordingError(
-            f"{path}: no rows in data/**/*.parquet; download the dataset's data folder"
-        )
+    require(
+        len(columns["timestamp"]) > 0,
+        f"{path}: no rows in data/**/*.parquet; download the dataset's data folder",
+    )
     return columns
 
 
@@ -250,8 +252,10 @@ def _lerobot_joints(
     path: Path, values: np.ndarray, names: Sequence[str], joints: Sequence[str]
 ) -> np.ndarray:
     """Values [T, J] of the joints of a column, whose elements have ``names``."""
-    if values.shape[1:] != (len(names),):
-        raise RecordingError(f"{path}: {len(names)} names for values of shape {values.shape[1:]}")
+    require(
+        values.shape[1:] == (len(names),),
+        f"{path}: {len(names)} names for values of shape {values.shape[1:]}",
+    )
     return values[:, [names.index(joint) for joint in joints]]
 
 
@@ -290,8 +294,7 @@ def read_ros(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
     except (AnyReaderError, OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: no bag that can be read: {error}") from error
     for topic, heard in messages.items():
-        if not heard:
-            raise RecordingError(f"{path}: no message on {topic}; record it, or name another topic")
+        require(bool(heard), f"{path}: no message on {topic}; record it, or name another topic")
     yield _held(path, messages[state], messages[command], options)
 
 
@@ -387,26 +390,30 @@ def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:
     if not hasattr(message, "points"):
         return _in_order(path, message.name, message.position, joints)
     points = message.points
-    if len(points) != 1:
-        raise RecordingError(
-            f"{path}: a JointTrajectory of {len(points)} points says what a controller is to "
-            "make of it, not what was sent; give a --command-topic of positions"
-        )
+    require(
+        len(points) == 1,
+        f"{path}: a JointTrajectory of {len(points)} points says what a controller is to "
+        "make of it, not what was sent; give a --command-topic of positions",
+    )
     return _in_order(path, message.joint_names, points[0].positions, joints)
 
 
 def _in_order(path: Path, names: Sequence[str], values: Any, joints: Sequence[str]) -> np.ndarray:
     """Values of a message in the order of the joints; NaN for those it leaves out."""
-    if len(values) not in (0, len(names)):
-        raise RecordingError(f"{path}: a message has {len(values)} values for {len(names)} joints")
+    require(
+        len(values) in (0, len(names)),
+        f"{path}: a message has {len(values)} values for {len(names)} joints",
+    )
     value_of = dict(zip(names, values, strict=False))
     return np.array([value_of.get(joint, np.nan) for joint in joints])
 
 
 def _files(path: Path, suffix: str) -> list[Path]:
     files = sorted(path.glob(f"*{suffix}")) if path.is_dir() else [path]
-    if not files or not files[0].is_file():
-        raise RecordingError(f"{path}: no {suffix} file there; name one, or a folder of them")
+    require(
+        bool(files) and files[0].is_file(),
+        f"{path}: no {suffix} file there; name one, or a folder of them",
+    )
     return files
 
 

@@ -348,7 +348,7 @@ def _read_columns(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def _without_repeats(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Columns without the rows of a log over a gap of the bus, which tell the state before once more."""
+    """Columns without rows that tell the state before once more: a log's, over a gap of the bus."""
     new = np.zeros(len(columns["t"]), dtype=bool)
     new[0] = True
     for name, values in columns.items():

@@ -216,7 +216,7 @@ def check_units(recording: Recording) -> None:
 
 
 def cautions(recording: Recording) -> tuple[str, ...]:
-    """Plain sentences about what the recording cannot show well, joints together where they share one."""
+    """Plain sentences about what the recording cannot show well."""
     sentences = []
     kinds: dict[str, set[str]] = {joint: set() for joint in recording.joints}
     steps = []

@@ -1,4 +1,4 @@
-"""What a policy's depth camera sees, with the object drawn in where the policy believes it to be."""
+"""What a policy's depth camera sees, with the object drawn in where it is believed to be."""
 
 from typing import Any
 
@@ -16,7 +16,9 @@ AXIS_M = 0.06
 
 
 def camera_view(actor: Any, world: int) -> np.ndarray:
-    """The depth image about the hand, near is bright, with surface points and axes of the believed pose.
+    """The depth image about the hand, near is bright.
+
+    Surface points and axes of the believed pose are drawn in.
 
     Args:
         actor: A :class:`vd.evaluate.tracking.CameraActor` that has acted.
@@ -31,7 +33,8 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     shade = np.where(depth > 0.0, 235.0 - 180.0 * _share(depth), 20.0)
     picture = Image.fromarray(np.repeat(shade.astype(np.uint8)[..., None], 3, axis=2))
     pose = actor.tracker.pose[world].cpu().numpy().astype(float)
-    turn, draw = Rotation.from_quat(pose[3:]), ImageDraw.Draw(picture)
+    turn = Rotation.from_quat(pose[3:])
+    draw = ImageDraw.Draw(picture)
     for u, v, ahead in model.project(pose[:3] + turn.apply(actor.surface(world))):
         if ahead > 0.0:
             draw.ellipse((u - 1, v - 1, u + 1, v + 1), fill=SURFACE_COLOR)

@@ -62,7 +62,7 @@ class PictureCamera:
 
     @staticmethod
     def for_hand(hand: HandModel) -> "PictureCamera":
-        """The default camera, turned about the vertical to look through the nearest gap between fingers."""
+        """The default camera, turned to look through the nearest gap between fingers."""
         camera = PictureCamera()
         tips = hand.tip_poses(hand.start)[:, :3]
         tips = Rotation.from_quat(hand.mount[3:]).apply(tips)
@@ -90,14 +90,14 @@ class PictureCamera:
         )
 
     def aimed_at(self, point: Sequence[float], radius: float) -> "PictureCamera":
-        """A camera that looks in the same direction at a ball about ``point`` [m], filling the picture."""
+        """A camera that looks the same way at a ball about ``point`` [m], which fills its picture."""
         distance = radius / math.sin(math.atan(BALL_SHARE * math.tan(0.5 * self.fov)))
         eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
         return replace(self, eye=_vector(eye), target=_vector(point))
 
 
 class Picture(NamedTuple):
-    """What the camera saw of one cell, RGB bytes, and the object in the goal's orientation, seen likewise."""
+    """What the camera saw of one cell, and of the object in the goal's orientation; RGB bytes."""
 
     scene: np.ndarray  # [height, width, 3]
     goal: np.ndarray  # [size, size, 3]

@@ -18,7 +18,7 @@ from vd.play.video import SINGLE_CELL, Snapshot, drawn, write_frames
 
 
 class Replay:
-    """The steps of a log as snapshots, and stepping through them as through a :class:`.session.Session`.
+    """The steps of a log as snapshots, with the methods of :class:`.session.Session`.
 
     It starts over at the end.
 

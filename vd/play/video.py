@@ -14,7 +14,7 @@ import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
 from vd.command.files import atomic_path
-from vd.evaluate.statistics import rotation_angle
+from vd.geometry.quaternions import rotation_distance
 from vd.paper import PAPER
 from vd.play.render import Picture, Renderer
 
@@ -100,7 +100,7 @@ class Watcher:
         error = env.rotation_error.numpy()[envs]
         table = env.has_table()[envs]
         if not stepped:  # what the environment holds is of the step before the reset
-            error = rotation_angle(q[:, -4:].astype(float), goal.astype(float))
+            error = rotation_distance(q[:, -4:].astype(float), goal.astype(float))
         return [
             Snapshot(
                 name=env.objects[env.world_object[world]].name,
@@ -121,7 +121,7 @@ class Watcher:
 def watched(
     env: "ReorientEnv", policy: Any, envs: Sequence[int], steps: int
 ) -> Iterator[list[Snapshot]]:
-    """Reset, run a policy, and give the start and every control step of the environments ``envs``."""
+    """Reset, run a policy, and give the start and every control step of some environments."""
     watcher = Watcher(env, envs)
     env.reset()
     yield watcher.read(stepped=False)
@@ -133,7 +133,7 @@ def watched(
 def drawn(
     renderer: Renderer, steps: Iterable[list[Snapshot]], *, meanwhile: bool = True
 ) -> Iterator[np.ndarray]:
-    """Draw each of ``steps``, on a thread of its own while the next one is made, unless not ``meanwhile``.
+    """Draw each of ``steps``; with ``meanwhile`` while the next one is made, on another thread.
 
     So the kernels of both are compiled at the same time. The renderer has a cell for each snapshot
     of a step.
@@ -241,7 +241,7 @@ def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
 
 def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    """Write frames, RGB bytes [height, width, 3], one at least, to a video as they come, atomically.
+    """Write frames, RGB bytes [height, width, 3], to a video as they come, atomically.
 
     H.264 plays everywhere. Returns the number of frames.
     """

@@ -1,4 +1,4 @@
-"""The web viewer: Newton's viser viewer with goal ghost, menus of policies and objects, a camera's view.
+"""The web viewer: Newton's viser viewer with goal ghost, menus, and a camera's view.
 
 Browser events arrive on viser's threads; they are queued and handled between steps on the thread
 that runs the simulation. Everything is served from this machine, so it works without a network.

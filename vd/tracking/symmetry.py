@@ -14,7 +14,7 @@ import warp as wp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.geometry import random_surface_points
+from vd.assets_usd.objects.geometry import Surface, random_surface_points
 from vd.assets_usd.objects.model import ObjectModel
 from vd.geometry.arrays import Array, library_of, library_on
 from vd.geometry.quaternions import product, rotation_distance
@@ -142,7 +142,7 @@ class _Surface:
             wp.array(item.vertices, dtype=wp.vec3, device=device),
             wp.array(item.faces.ravel(), dtype=wp.int32, device=device),
         )
-        samples = random_surface_points(item.vertices, item.faces, DENSE, rng)
+        samples = random_surface_points(Surface(item.vertices, item.faces), DENSE, rng)
         self._points = np.concatenate([samples, item.vertices])
         self._most_m = STICKS_OUT * item.longest_side
 
