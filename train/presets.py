@@ -211,6 +211,7 @@ def spin(preset: str, hand: str) -> TeacherCfg:
     base = in_palm(preset, hand, ("cube", "cylinder"))
     return replace(
         base,
+        ppo=replace(base.ppo, gamma=0.99),  # HORA's; nothing is farther than the next turn
         # Nothing has to become still.
         policy=replace(base.policy, std_range=(0.1, 0.6), quiet_std=None),
         env=replace(
