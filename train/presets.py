@@ -234,14 +234,7 @@ def spin(preset: str, hand: str) -> TeacherCfg:
             ),
             start=StartCfg(at_rest=True),
             curriculum=CurriculumCfg(),
-            randomisation=RandomisationCfg(
-                friction=(0.3, 3.0),
-                object_mass_kg=(0.01, 0.25),
-                object_scale=(0.8, 1.2),
-                object_scale_count=5,
-                object_com_m=0.01,
-                redraw_s=10.0,
-            ),
+            randomisation=replace(CONDITIONS["hora"], redraw_s=10.0),
         ),
     )
 
