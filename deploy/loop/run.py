@@ -302,9 +302,7 @@ def _pursue(
             looks = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
-        question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
-        if runner.spin_axis is not None:
-            question = "The hand will turn what lies in it."
+        question = _question(cfg, runner, len(goals))
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=looks)
         description = _description(cfg, name, runner, item, goals)
         log = _log(cfg, folder, connection, description)
@@ -350,6 +348,13 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _question(cfg: DriveCfg, runner: "PolicyRunner", goals: int) -> str:
+    """What the hand is about to do."""
+    if runner.spin_axis is not None:
+        return "The hand will turn what lies in it."
+    return f"The hand will pursue {goals} goals{', and those it is given' * cfg.ros2}."
 
 
 def _camera(

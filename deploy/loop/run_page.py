@@ -67,7 +67,7 @@ def goal_results(log: HandLog) -> list[GoalResult]:
         turned = None
         if "error" in columns and axis is None:
             error = float(columns["error"][rows[-1]])
-        elif "error" in columns:
+        elif axis is not None and "error" in columns:
             turned = revolutions(np.transpose([columns[name][rows] for name in ORIENTATION]), axis)
         results.append(
             GoalResult(
