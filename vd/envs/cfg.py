@@ -47,7 +47,7 @@ class SpinCfg:
     """Speed about it from which more is worth nothing [rad/s]; HORA: 0.5."""
     object_speed: float = -0.3
     """Times the sum of the absolute components of the object's velocity [s/m]."""
-    posture: float = -0.03
+    posture: float = -0.02
     """Times the summed squared distance of the joints from their start [1/rad^2]; HORA: -0.3."""
     torque: float = -0.1
     """Times the summed squared torque of the joints [1/(N m)^2]."""
