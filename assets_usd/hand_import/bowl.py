@@ -77,13 +77,15 @@ class Drops:
             )
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._finger = np.full(self._model.ngeom, -1)
-        fingers = {hand.joint_child[j]: f for j, f in enumerate(hand.joint_finger)}
-        for geom in range(self._model.ngeom):
-            name = self._model.body(self._model.geom_bodyid[geom]).name
-            kind_of, _, number_of = name.partition(" ")
-            if kind_of == "link":
-                self._finger[geom] = fingers.get(int(number_of), -1)
+        fingers = dict(zip(hand.joint_child.tolist(), hand.joint_finger.tolist(), strict=True))
+        of_geom = [fingers.get(link, -1) for link in self._model.geom_bodyid - 1]
+        pairs = [
+            (a, b)
+            for a, b in combinations(range(len(hand.shapes)), 2)
+            if -1 < of_geom[a] != of_geom[b] > -1
+        ]
+        self._pairs = np.array(pairs, dtype=int).reshape(-1, 2)
+        """Geoms of two fingers; bodies and geoms of the hand come first, in the order of links."""
 
     def score(self, links: np.ndarray, workspace: Workspace) -> tuple[float, float]:
         """How good a pose is, and the share of the objects that stay in it.
@@ -123,16 +125,15 @@ class Drops:
 
     def _crossing(self) -> int:
         """Pairs of colliders of two fingers that are in each other."""
-        model = self._model
-        data = self._data
-        own = np.flatnonzero(self._finger >= 0)
-        count = 0
-        for a, b in combinations(own, 2):
-            gap = np.linalg.norm(data.geom_xpos[a] - data.geom_xpos[b])
-            if self._finger[a] == self._finger[b] or gap > model.geom_rbound[[a, b]].sum():
-                continue
-            count += mujoco.mj_geomDistance(model, data, a, b, TOUCH_M, None) < -TOUCH_M
-        return count
+        first, second = self._pairs.T
+        place = self._data.geom_xpos
+        reach = self._model.geom_rbound
+        gap = np.linalg.norm(place[first] - place[second], axis=1)
+        near = self._pairs[gap < reach[first] + reach[second]]
+        apart = [
+            mujoco.mj_geomDistance(self._model, self._data, a, b, TOUCH_M, None) for a, b in near
+        ]
+        return int(np.sum(np.array(apart) < -TOUCH_M))
 
 
 @dataclass(frozen=True)
