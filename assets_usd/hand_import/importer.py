@@ -69,7 +69,7 @@ def import_hand(
         HandError: The file cannot be imported; says why and what to do.
     """
     said = read_description(describe)
-    searched = []
+    searched: list[str] = []
     if bowl and not said.start:
         said, searched = _with_bowl(path, said)
     source = read_source(path)
