@@ -53,13 +53,16 @@ class HandImport:
     """YAML with what the file does not say, or the name of a built-in one: leap, allegro."""
     out: Path | None = None
     """Folder to write to; by default one of the asset cache, named after the hand."""
+    bowl: bool = True
+    """Search the start pose of a palm that looks up, where none is described: what is dropped stays
+    in it. It takes a minute."""
 
     def run(self) -> int:
         """Import a hand."""
         from vd.assets_usd.hand_import.importer import import_hand
         from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
 
-        done = import_hand(self.file, self.out, self.describe)
+        done = import_hand(self.file, self.out, self.describe, bowl=self.bowl)
         print("\n".join([*done.notes, *(f"warning: {text}" for text in done.warnings)]))
         print(joint_table(done.hand, done.sources))
         hand_sheet(done.hand, done.sources, done.hand.path.with_suffix(".png"))

@@ -16,10 +16,12 @@ from vd.envs.cfg import (
     RandomisationCfg,
     ReorientCfg,
     RewardCfg,
+    SpinCfg,
     StartCfg,
     SuccessCfg,
     TableCfg,
 )
+from vd.envs.parts import observation_columns
 from vd.envs.reorient import ReorientEnv
 from vd.envs.setup import ALWAYS, chosen, table_steps
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
@@ -388,3 +390,53 @@ def rising(**loose) -> CurriculumCfg:
 def test_settings_that_cannot_work_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         ReorientCfg(**changes).validate()
+
+
+def spinning(**reward) -> ReorientEnv:
+    """Environments that turn without a goal, seen by the joints of five steps."""
+    return make(
+        reward=RewardCfg(spin=SpinCfg(rate=1.0, **reward)),
+        observation=ObservationCfg(history=5, shape="full", dynamics="critic"),
+        success=SuccessCfg(rotation_rad=np.pi, joint_speed_rad_s=0.0, action_norm=0.0),
+        episode_s=1.0,
+    )
+
+
+def test_what_spins_has_no_goal_and_counts_its_turns_anew_in_each_episode():
+    env = spinning()
+    turned = []
+    for _ in range(12):
+        env.advance(env.action)
+        assert not env.success.numpy().any(), "any orientation would do"
+        assert env.spin is not None
+        turned.append(env.spin.turned.numpy().copy())
+        column = env.reward_term_names.index("spin")
+        paid = env.reward_terms.numpy()[:, column].copy()
+        env.renew()
+    np.testing.assert_allclose(
+        paid, np.clip(12.0 * (turned[-1] - turned[-2]), -1.0, 1.0), atol=1e-4
+    )
+    assert np.abs(turned[-1]).min() > 1e-4, "what falls between fingers turns"
+    assert not env.spin.turned.numpy().any(), "the episode ended"
+
+
+def test_a_policy_of_joints_sees_neither_the_object_nor_a_goal():
+    """The last step of its history is what the critic sees of the joints."""
+    env = spinning()
+    run(env, 6)
+    columns = observation_columns(env.cfg.observation, env.num_fingers, env.num_joints)
+    joints = 2 * env.num_joints
+    assert [name for name in columns if not name.startswith("critic/")] == ["history"]
+    assert env.num_observations == 5 * joints
+    everything = np.hstack([env.observation.numpy(), env.privileged.numpy()])
+    for name, half in (("joint_position", slice(None, 9)), ("previous_action", slice(9, None))):
+        told = everything[:, columns[f"critic/{name}"]]
+        assert np.array_equal(env.observation.numpy()[:, -joints:][:, half], told)
+    seen = env.observation.numpy().copy()
+    q = env.sim.joint_q.numpy()
+    q[:, env.num_joints :] += 0.1
+    env.sim.joint_q.assign(q)
+    env.give_goals(np.arange(WORLDS), np.tile([0.0, 0.0, 1.0, 0.0], (WORLDS, 1)))
+    now = env.observation.numpy()
+    assert np.array_equal(now[:, :-joints], seen[:, joints:]), "older steps move up"
+    assert np.array_equal(now[:, -joints:][:, :9], seen[:, -joints:][:, :9])

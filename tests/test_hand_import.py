@@ -10,6 +10,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import newton
@@ -20,7 +21,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd import cli
-from vd.assets_usd.hand_data import HandError, HandModel
+from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, Workspace, compose
+from vd.assets_usd.hand_import import bowl
+from vd.assets_usd.hand_import.bowl import NEAR, Drops
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
@@ -551,10 +554,12 @@ def test_a_wrong_description_is_refused(tmp_path, text, words):
 
 
 def test_command_imports_into_the_cache_and_draws_a_sheet(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bowl, "ROUNDS", 1)
     monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
     monkeypatch.setattr(sys, "argv", ["vd-assets", "hand", "import", str(write_urdf(tmp_path))])
     assert cli.main() == 0
     said = capsys.readouterr().out
+    assert "guess: starts as a bowl" in said
     assert "guess: the palm looks along" in said and "f1_j4  b4" in said and "0.8 x f1_j3" in said
     hand = load_hand("toy")
     assert hand.path == tmp_path / "cache" / "hands" / "toy" / "toy.usda" and hand.num_joints == 6
@@ -566,6 +571,68 @@ def test_command_imports_into_the_cache_and_draws_a_sheet(tmp_path, monkeypatch,
     assert cli.main() == 1 and "neither a URDF nor an MJCF" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"'claw'.*import one"):
         load_hand("claw")
+
+
+def plates(*half_and_place: tuple[tuple[float, float, float], tuple[float, float, float]]):
+    """Boxes as colliders of links: a base, and fingers of one link each."""
+    boxes = [
+        CollisionShape(
+            "", i, "box", half, np.array([*place, 0, 0, 0, 1.0]), np.zeros((0, 3)), 0.8, False
+        )
+        for i, (half, place) in enumerate(half_and_place)
+    ]
+    fingers = np.arange(len(boxes) - 1)
+    names = tuple(map(str, range(len(boxes))))
+    return SimpleNamespace(
+        shapes=boxes, link_names=names, joint_child=fingers + 1, joint_finger=fingers
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "fingers", "kept", "crossing"),
+    [
+        ((0.0, 0.0, -0.02), (), 1.0, 0),
+        ((1.0, 0.0, -0.02), (), 0.0, 0),
+        ((0.0, 0.0, 0.04), (), 1.0, 0),
+        ((0.0, 0.0, -0.02), ((0.6, 0.0, 0.0), (0.615, 0.0, 0.0)), 1.0, 1),
+        ((0.0, 0.0, -0.02), ((0.6, 0.0, 0.0), (0.63, 0.0, 0.0)), 1.0, 0),
+    ],
+    ids=["plate", "beside", "raised out of it", "crossing", "apart"],
+)
+def test_what_falls_on_a_plate_stays_and_what_falls_beside_it_does_not(
+    place, fingers, kept, crossing
+):
+    """Fingers that are in each other cost as much as all objects."""
+    hand = plates(((0.5, 0.5, 0.01), place), *(((0.01, 0.01, 0.01), where) for where in fingers))
+    drop = (0.0, 0.0, 0.05)
+    workspace = Workspace(drop_m=drop, goal_m=drop, fall_m=0.15, size_m=(0.03, 0.05))
+    links = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(hand.shapes), 1))
+    value, share = Drops(hand, workspace.size_m).score(links, workspace)
+    assert share == kept
+    assert kept - crossing - NEAR <= value < kept - crossing + 1e-9
+
+
+def test_a_palm_up_hand_starts_as_the_best_bowl_that_was_tried(tmp_path, monkeypatch):
+    monkeypatch.setattr(bowl, "ROUNDS", 2)
+    path = write_urdf(tmp_path)
+    done = import_hand(path, tmp_path / "out", bowl=True)
+    plain = import_hand(path, tmp_path / "plain").hand
+    hand = done.hand
+    assert (hand.start >= hand.lower).all() and (hand.start <= hand.upper).all()
+    np.testing.assert_allclose(hand.start[5], 0.8 * hand.start[4] + 0.05, atol=1e-6)
+    assert hand.workspace.size_m == pytest.approx(plain.workspace.size_m)
+    drops = Drops(hand, hand.workspace.size_m)
+    values = [
+        drops.score(compose(each.mount, each.forward_kinematics(each.start)), each.workspace)
+        for each in (hand, plain)
+    ]
+    assert values[0][0] > values[1][0] + 0.1, "open, it holds little"
+    (note,) = (note for note in done.notes if "bowl" in note)
+    assert f"{values[0][1]:.0%} of 32" in note and f"for {values[1][1]:.0%}" in note
+    (tmp_path / "said.yaml").write_text("start: {a1: 0.3}")
+    described = import_hand(path, tmp_path / "said", tmp_path / "said.yaml", bowl=True)
+    assert described.hand.start[0] == pytest.approx(0.3)
+    assert not any("bowl" in note for note in described.notes)
 
 
 @pytest.mark.parametrize("name", REAL)

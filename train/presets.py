@@ -17,6 +17,7 @@ from vd.envs.cfg import (
     RandomisationCfg,
     ReorientCfg,
     RewardCfg,
+    SpinCfg,
     StartCfg,
     SuccessCfg,
     TableCfg,
@@ -35,7 +36,10 @@ class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
     preset: Annotated[
-        str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo,leap-cube,leap-objects,allegro-cube}")
+        str,
+        tyro.conf.arg(
+            metavar="{paper,gpu,cpu-demo,leap-cube,leap-objects,leap-spin,allegro-cube,allegro-spin}"
+        ),
     ] = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on
     this machine."""
@@ -198,6 +202,43 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
     )
 
 
+def spin(preset: str, hand: str) -> TeacherCfg:
+    """An imported hand, palm up, turns what lies in it about the vertical, by its joints alone.
+
+    Reward, sizes, masses and frictions are after HORA's and LEAP_Hand_Sim's; arguments as of
+    :func:`in_palm`.
+    """
+    base = in_palm(preset, hand, ("cube", "cylinder"))
+    return replace(
+        base,
+        ppo=replace(base.ppo, gamma=0.99),  # HORA's; nothing is farther than the next turn
+        # Nothing has to become still.
+        policy=replace(base.policy, std_range=(0.1, 0.6), quiet_std=None),
+        env=replace(
+            base.env,
+            episode_s=20.0,
+            # Still as strong as the motors; HORA: 0.8 rad/s.
+            action=replace(base.env.action, scale_rad_s=1.5),
+            observation=replace(base.env.observation, history=30, dynamics="critic"),
+            # None of it was tuned. A fall costs twice what the posture of an untrained hand does.
+            reward=RewardCfg(
+                success=0.0,
+                rotation=0.0,
+                fingertip=0.0,
+                energy=-0.1,
+                energy_clip_w=PAPER.reward.energy_clip_w_code,
+                fall=-20.0,
+                table_contact=0.0,
+                scale=0.1,
+                spin=SpinCfg(rate=1.0),
+            ),
+            start=StartCfg(at_rest=True),
+            curriculum=CurriculumCfg(),
+            randomisation=replace(CONDITIONS["hora"], redraw_s=10.0),
+        ),
+    )
+
+
 def cpu_demo() -> TeacherCfg:
     """Minutes on two cores, on an easier task.
 
@@ -245,7 +286,9 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "gpu": gpu,
     "leap-cube": partial(in_palm, "leap-cube", "leap"),
     "leap-objects": partial(in_palm, "leap-objects", "leap", TRAINING_SET),
+    "leap-spin": partial(spin, "leap-spin", "leap"),
     "allegro-cube": partial(in_palm, "allegro-cube", "allegro"),
+    "allegro-spin": partial(spin, "allegro-spin", "allegro"),
 }
 """Presets by name."""
 

@@ -61,6 +61,14 @@ def take_stance(tree: Tree, said: Description) -> Stance:
     start = _start(tree, said)
     _complete_drives(tree, start)
     palm = _palm(tree, tips, said)
+    mount, workspace = stand(tree, tips, start, palm, said)
+    return Stance(tips, start, palm, mount, workspace)
+
+
+def stand(
+    tree: Tree, tips: list[np.ndarray], start: np.ndarray, palm: np.ndarray, said: Description
+) -> tuple[np.ndarray, Workspace]:
+    """Mount and workspace of a hand at a start [D]; what is guessed goes into the tree's notes."""
     ends = _roots(tree), _tip_points(tree, tips, start)
     if said.mount is not None:
         quaternion = np.array(said.mount.quaternion) / np.linalg.norm(said.mount.quaternion)
@@ -68,7 +76,7 @@ def take_stance(tree: Tree, said: Description) -> Stance:
     else:
         mount = _mount(tree, ends, start, palm)
         tree.notes.append(f"guess: mounted palm up at {_text(mount)} (mount)")
-    return Stance(tips, start, palm, mount, _workspace(tree, ends, palm, mount, said.workspace))
+    return mount, _workspace(tree, ends, palm, mount, said.workspace)
 
 
 def _text(values: np.ndarray) -> str:

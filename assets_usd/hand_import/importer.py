@@ -3,7 +3,7 @@
 import math
 import shutil
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -12,8 +12,9 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandError, HandModel, compose
 from vd.assets_usd.hand_import.author import Author
-from vd.assets_usd.hand_import.description import BUILT_IN, read_description
-from vd.assets_usd.hand_import.guess import Stance, critical_damping, take_stance
+from vd.assets_usd.hand_import.bowl import OBJECTS, add_shape, find_bowl
+from vd.assets_usd.hand_import.description import BUILT_IN, Description, read_description
+from vd.assets_usd.hand_import.guess import Stance, critical_damping, stand, take_stance
 from vd.assets_usd.hand_import.source import Source, read_source
 from vd.assets_usd.hand_import.tree import Tree, grow
 from vd.assets_usd.hand_model import open_stage, read_hand
@@ -29,6 +30,8 @@ unit.
 """
 BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
+ANGLE_DIGITS = 2
+"""Of a start that is proposed [rad], to be copied."""
 LEAST_DAMPING_RATIO = 0.2
 """A drive that is damped less swings for long."""
 MOST_EFFORT_NM = 5.0
@@ -49,7 +52,9 @@ class Imported:
     """What the file calls the joints [D]."""
 
 
-def import_hand(path: Path, out: Path | None, describe: str | Path | None = None) -> Imported:
+def import_hand(
+    path: Path, out: Path | None, describe: str | Path | None = None, *, bowl: bool = False
+) -> Imported:
     """Import a hand.
 
     Args:
@@ -58,14 +63,19 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
             from which commands take the hand by its name.
         describe: YAML, or the name of a built-in one
             (:mod:`vd.assets_usd.hand_import.description`).
+        bowl: Whether to search the start of a palm that looks up, if it is not described.
 
     Raises:
         HandError: The file cannot be imported; says why and what to do.
     """
     said = read_description(describe)
+    searched: list[str] = []
+    if bowl and not said.start:
+        said, searched = _with_bowl(path, said)
     source = read_source(path)
     tree = grow(source, said)
     stance = take_stance(tree, said)
+    tree.notes.extend(searched)
     _check_units(source, tree, stance)
     name = prim_name(said.name or source.name)
     if name in HANDS:
@@ -92,6 +102,34 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
         for file in Path(scratch).iterdir():
             shutil.copy(file, folder / file.name)
     return Imported(read_hand(folder / target.name), tree.notes, warnings, tree.names)
+
+
+def _with_bowl(path: Path, said: Description) -> tuple[Description, list[str]]:
+    """A description with the start that was found, and what to say of it.
+
+    Of a palm that does not look up as it is.
+    """
+    source = read_source(path)
+    tree = grow(source, said)
+    stance = take_stance(tree, said)
+    _check_units(source, tree, stance)
+    with tempfile.TemporaryDirectory() as scratch:
+        author = Author(tree, stance, said, "bowl")
+        hand = read_hand(author.write(Path(scratch), _untouched(source, tree)))
+    if not hand.palm_up:
+        return said, []
+    open_place = stance.workspace
+    place = replace(said.workspace, size=open_place.size_m, fall=open_place.fall_m)
+    said = replace(said, workspace=place)
+    found = find_bowl(hand, lambda q: stand(tree, stance.tips, q, stance.palm, said))
+    angles = dict(zip(tree.names, found.start.round(ANGLE_DIGITS).tolist(), strict=True))
+    led = [joint.name for joint in tree.joints if joint.mimic is not None]
+    note = (
+        f"guess: starts as a bowl in which {found.kept:.0%} of {OBJECTS} dropped spheres and cubes "
+        f"stay, for {found.kept_before:.0%} with joints at zero (start); they measure "
+        f"{1e3 * open_place.size_m[0]:.0f} to {1e3 * open_place.size_m[1]:.0f} mm (workspace)"
+    )
+    return replace(said, start={n: q for n, q in angles.items() if n not in led}), [note]
 
 
 def _replaced(path: Path, source: Source) -> list[str]:
@@ -216,17 +254,7 @@ def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int
     spec = mujoco.MjSpec()
     for number, shape in enumerate(hand.shapes):
         pose = compose(links[shape.link], shape.frame)
-        kind = "mesh" if shape.kind == "hull" else shape.kind
-        geom = spec.worldbody.add_geom(
-            type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
-            size=[*shape.size, 0.0, 0.0][:3],
-            pos=pose[:3],
-            quat=pose[[6, 3, 4, 5]],
-        )
-        if kind == "mesh":
-            geom.meshname = f"hull {number}"
-            mesh = spec.add_mesh(name=geom.meshname, uservert=shape.vertices.ravel())
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        add_shape(spec, spec.worldbody, shape, f"hull {number}", pose)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

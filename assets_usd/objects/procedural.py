@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
 
+from vd.assets_usd.objects import primitives
 from vd.assets_usd.objects.bodies import solid_by_points
 from vd.assets_usd.objects.geometry import (
     Hull,
@@ -202,12 +203,12 @@ def procedural_set(count: int, seed: int, *, families: str = "training") -> list
     return models
 
 
-def _block(name: str, sides: Sequence[float], group: str, version: str) -> ObjectModel:
-    """A box of sides [m] with its rotation group, the identity first."""
+def _symmetric(name: str, part: Hull, group: str, version: str) -> ObjectModel:
+    """A convex part [m] with its rotation group, the identity first."""
     turns = Rotation.create_group(group)
     return model_of_parts(
         name,
-        [box((0, 0, 0), sides)],
+        [part],
         family="symmetric",
         source=f"procedural {name}",
         symmetry=turns[np.argsort(turns.magnitude(), kind="stable")].as_quat(canonical=True),
@@ -217,9 +218,16 @@ def _block(name: str, sides: Sequence[float], group: str, version: str) -> Objec
 
 def cube() -> ObjectModel:
     """The cube, with its group of 24 rotations."""
-    return _block("cube", [CUBE_SIDE_M] * 3, "O", f"{CUBE_SIDE_M}")
+    return _symmetric("cube", box((0, 0, 0), [CUBE_SIDE_M] * 3), "O", f"{CUBE_SIDE_M}")
 
 
 def cuboid() -> ObjectModel:
     """The cuboid, with its group of four rotations."""
-    return _block("cuboid", CUBOID_SIDES_M, "D2", f"{list(CUBOID_SIDES_M)}")
+    return _symmetric("cuboid", box((0, 0, 0), CUBOID_SIDES_M), "D2", f"{list(CUBOID_SIDES_M)}")
+
+
+def cylinder() -> ObjectModel:
+    """The cylinder, as wide and as long as the cube, of as many sides as has its group."""
+    half = CUBE_SIDE_M / 2
+    part = primitives.cylinder((0, 0, -half), (0, 0, half), half)
+    return _symmetric("cylinder", part, f"D{primitives.SIDES}", f"{CUBE_SIDE_M}")

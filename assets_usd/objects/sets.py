@@ -18,7 +18,7 @@ from vd.command.files import make_folder, writing
 HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""
 
-BUILT_IN = ("cube", "cuboid", "symmetric", "procedural-150-seed0", "procedural-heldout")
+BUILT_IN = ("cube", "cuboid", "cylinder", "symmetric", "procedural-150-seed0", "procedural-heldout")
 """Sets named in help texts; ``procedural-<count>-seed<seed>`` and
 ``procedural-heldout-<count>-seed<seed>`` take any numbers."""
 
@@ -60,8 +60,10 @@ def check_set_folder(folder: Path) -> None:
 
 
 def _built_in_models(name: str) -> list[ObjectModel]:
-    from vd.assets_usd.objects.procedural import cube, cuboid, procedural_set
+    from vd.assets_usd.objects.procedural import cube, cuboid, cylinder, procedural_set
 
+    if name == "cylinder":
+        return [cylinder()]
     if name in ("cube", "cuboid", "symmetric"):
         return [make() for make in (cube, cuboid) if name in (make.__name__, "symmetric")]
     match = _PROCEDURAL.fullmatch(name)

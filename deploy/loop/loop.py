@@ -276,6 +276,8 @@ class ControlLoop:
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
             doing = f"distance {decision.distance:.2f} rad" if acting else "holding"
+            if acting and np.isnan(decision.distance):
+                doing = "acting"
             motors = f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A"
             print(
                 f"goal {number + 1} | {doing}"

@@ -24,6 +24,8 @@ from vd.tracking.tracker import Tracker
 if TYPE_CHECKING:
     from vd.vision.acting import StudentPolicy
 
+SPIN_S = 30.0
+"""For how long an object is turned where nothing is asked for [s], as by HORA."""
 ZERO = "zero"
 """Name of the zero-action baseline."""
 
@@ -80,12 +82,17 @@ class PolicyRunner:
         rule: When it has arrived.
 
     Attributes:
-        kind: tracking, vision, student, teacher or zero.
+        kind: tracking, vision, student, teacher, joints or zero.
         camera: Where its depth camera has to be; None: it has none.
         calibrated: Whether its rule to stop comes from episodes.
+        spin_axis: Axis about which it turns an object without a goal, in the world; None: it has
+            goals.
+        goal_s: Usual time for a goal, or to turn [s].
     """
 
     kind = ZERO
+    spin_axis: tuple[float, float, float] | None = None
+    goal_s = PAPER.scene.episode_s
     camera: CameraModel | None = None
     calibrated = True
 
@@ -148,8 +155,21 @@ class TeacherPolicyRunner(PolicyRunner):
     def decide(self, sensed: Sensed) -> PolicyDecision:
         """What it does in this state."""
         env = self._env
-        sim = self._env.sim
         state = self._before if sensed.object_state is None else sensed.object_state
+        self._put(sensed, state)
+        if self._begins:
+            env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
+            self._begins = sensed.object_state is None
+        action = self._act()
+        if sensed.object_state is None:
+            return PolicyDecision(np.zeros_like(sensed.smoothed), float("nan"))
+        error = symmetric_error(state[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
+        return PolicyDecision(action, float(error[0]))
+
+    def _put(self, sensed: Sensed, state: np.ndarray) -> None:
+        """Bring the environment into what is sensed, with the object in ``state`` [13]."""
+        env = self._env
+        sim = env.sim
         for array, joints, rest in (
             (sim.joint_q, sensed.joint_q, state[:7]),
             (sim.joint_qd, sensed.joint_qd, state[7:]),
@@ -159,18 +179,39 @@ class TeacherPolicyRunner(PolicyRunner):
         ):
             array.assign(np.array([[*joints, *rest]], dtype=np.float32)[:, : array.shape[1]])
         sim.forward_kinematics()
-        if self._begins:
-            env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
-            self._begins = sensed.object_state is None
+
+    def _act(self) -> np.ndarray:
+        """Mean action [D] for what the environment observes."""
+        env = self._env
         env.observe()
         observation = of_warp(env.observation, library_of(self._policy.network.offset))
         action = as_warp(self._policy.act(observation))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
-        if sensed.object_state is None:
-            return PolicyDecision(np.zeros_like(sensed.smoothed), float("nan"))
-        error = symmetric_error(state[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
-        return PolicyDecision(action.numpy()[0].copy(), float(error[0]))
+        mean: np.ndarray = action.numpy()[0].copy()
+        return mean
+
+
+class JointPolicyRunner(TeacherPolicyRunner):
+    """A policy that senses its joints alone, and turns what lies in the hand; arguments as of a teacher.
+
+    Nobody tells it of the object, so it never stops by itself.
+    """
+
+    kind = "joints"
+    goal_s = SPIN_S
+
+    def __init__(self, policy: Any, hand_name: str, object: str, tolerance_rad: float):
+        super().__init__(policy, hand_name, object, tolerance_rad)
+        self.spin_axis = self.task.reward.spin.axis
+
+    def decide(self, sensed: Sensed) -> PolicyDecision:
+        """What it does after what the joints told so far."""
+        self._put(sensed, self._before)
+        if self._begins:
+            self._env.observer.begin(wp.ones(1, dtype=wp.int32, device="cpu"))
+        self._begins = False
+        return PolicyDecision(self._act(), float("nan"))
 
 
 class CameraRunner(PolicyRunner):
@@ -281,7 +322,8 @@ def load_runner(
         object: What a twin holds, or what poses are of, for a teacher; None: nobody tells it.
 
     Raises:
-        ValueError: It is for another hand, or a teacher that nobody tells the object's state.
+        ValueError: It is for another hand, or a teacher that sees the object's state and that
+            nobody tells it.
     """
     if name == ZERO:
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
@@ -290,6 +332,8 @@ def load_runner(
     if policy is None:
         raise ValueError(f"{name} is not for a hand; give a policy, or {ZERO}")
     check_fits(name, policy, hand_name)
+    if ReorientCfg.of(policy).observation.history:
+        return JointPolicyRunner(policy, hand_name, object or "cube", tolerance_rad)
     if policy.kind != "teacher":
         return CameraRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if object is not None:

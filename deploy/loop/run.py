@@ -3,7 +3,8 @@
 Pursue goals one after the other, in one process at 12 Hz, and log every step.
 
 The policy sees joints and a depth camera: a tracking or vision policy. A teacher is told where the
-object is: by --pose, or by a twin, which tells the truth.
+object is: by --pose, or by a twin, which tells the truth. A policy that turns the object without a
+goal (leap-spin) senses its joints alone.
 """
 
 import contextlib
@@ -60,6 +61,8 @@ WARM_UP = 3
 """Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
 FIRST_IMAGE_S = 5.0
 """Longest wait for a camera's first image."""
+NO_GOAL = [np.array([0.0, 0.0, 0.0, 1.0])]
+"""What is pursued once by a policy that knows no goal."""
 GOALS = 3
 """Goals that are drawn where nothing is asked for."""
 PLACE = "Put the object between the fingers, then press Enter alone."
@@ -71,8 +74,9 @@ class DriveCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """File or name of a policy that sees by camera, with --twin or --pose a teacher too, and by
-    default the hand's installed vision or tracking policy. "zero" is the zero-action baseline."""
+    """File or name of a policy that sees by camera or senses its joints alone, with --twin or --pose
+    a teacher too, by default the hand's installed vision or tracking policy. "zero" is the
+    zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
     .glb).
@@ -83,8 +87,9 @@ class DriveCfg(HandOptions):
     random_goals: int | None = None
     """How many goals to draw in place of --goal, each far from the one before; three by default.
     With --ros2 none are drawn."""
-    episode_s: float = PAPER.scene.episode_s
-    """Time for each goal [s]; then the next one is pursued."""
+    episode_s: float | None = None
+    """Time for each goal [s]; then the next one is pursued. 10 by default, 30 for a policy that
+    turns the object without goals."""
     hold_s: float = 1.0
     """How long the hand holds still between goals [s]."""
     precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -196,6 +201,8 @@ def run(cfg: DriveCfg) -> int:
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
     runner = _runner(cfg, name, hand, item)
+    if runner.spin_axis is not None:
+        goals = NO_GOAL
     fault: Exception | None = None
     status = 0
     opened = connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, item=item)
@@ -230,8 +237,9 @@ def _runner(cfg: DriveCfg, name: str, hand: "HandModel", item: "ObjectModel") ->
     runner = load_runner(
         name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=known_object
     )
-    if cfg.pose and runner.camera is not None:
-        raise ValueError(f"--pose is for a teacher; {name} sees by camera: leave it out")
+    if cfg.pose and (runner.camera is not None or runner.spin_axis is not None):
+        sees = "by camera" if runner.camera is not None else "its joints alone"
+        raise ValueError(f"--pose is for a teacher; {name} sees {sees}: leave it out")
     if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
         sys.modules["torch"].set_num_threads(1)
     if not runner.calibrated:
@@ -294,7 +302,7 @@ def _pursue(
             looks = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
-        question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
+        question = _question(cfg, runner, len(goals))
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=looks)
         description = _description(cfg, name, runner, item, goals)
         log = _log(cfg, folder, connection, description)
@@ -321,7 +329,7 @@ def _pursue(
                     ActionFilter(hand, runner.task),
                     pacer,
                     log,
-                    episode_s=cfg.episode_s,
+                    episode_s=cfg.episode_s or runner.goal_s,
                     hold_s=cfg.hold_s,
                     camera=camera,
                     twin=twin,
@@ -340,6 +348,13 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _question(cfg: DriveCfg, runner: "PolicyRunner", goals: int) -> str:
+    """What the hand is about to do."""
+    if runner.spin_axis is not None:
+        return "The hand will turn what lies in it."
+    return f"The hand will pursue {goals} goals{', and those it is given' * cfg.ros2}."
 
 
 def _camera(
@@ -427,6 +442,7 @@ def _description(
         "stopping": vars(runner.rule),
         "tolerance_rad": cfg.tolerance_rad,
         "action": vars(runner.task.action),
+        "spin_axis": runner.spin_axis,
     }
 
 

@@ -6,14 +6,17 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vd.command import interrupt
 from vd.command.page import write_html
 from vd.deploy.safety.safety import LEFT_ON
 from vd.logs.hand_log import HandLog
-from vd.logs.log_format import FINISHED
+from vd.logs.log_format import FINISHED, TRUTH_COLUMNS
 
 FILM_FILE, PAGE_FILE = "run.mp4", "run.html"
+ORIENTATION = TRUTH_COLUMNS[3:7]
+"""Columns of the object's orientation."""
 ABORTED = "aborted"
 """Outcome of a goal that was still pursued when the run ended."""
 
@@ -36,9 +39,13 @@ class GoalResult:
     """
     success: bool | None
     """Whether the policy stopped within the tolerance; None where nobody knows."""
+    turned: float | None = None
+    """Revolutions about the axis of a policy without goals; None where nobody knows."""
 
     def __str__(self) -> str:
         """In one line."""
+        if self.turned is not None:
+            return f"turned {self.turned:.2f} times: {self.outcome} after {self.seconds:.1f} s"
         words = {True: "reached", False: "not reached", None: "error not known"}[self.success]
         far = "" if self.error_rad is None else f", {self.error_rad:.2f} rad from it"
         predicted = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
@@ -50,12 +57,18 @@ def goal_results(log: HandLog) -> list[GoalResult]:
     """How each goal ended that was pursued."""
     columns = log.columns
     stops = {stop.goal: stop for stop in log.stops}
+    axis = log.run.get("spin_axis")
     results = []
     for goal in np.unique(columns["goal"][columns["acting"] > 0.0]).astype(int):
         rows = np.flatnonzero((columns["goal"] == goal) & (columns["acting"] > 0.0))
         outcome = stops[goal].outcome if goal in stops else ABORTED
         predicted = float(columns["distance"][rows[-1]])
-        error = float(columns["error"][rows[-1]]) if "error" in columns else None
+        error = None
+        turned = None
+        if "error" in columns and axis is None:
+            error = float(columns["error"][rows[-1]])
+        elif axis is not None and "error" in columns:
+            turned = revolutions(np.transpose([columns[name][rows] for name in ORIENTATION]), axis)
         results.append(
             GoalResult(
                 goal=int(goal),
@@ -66,13 +79,24 @@ def goal_results(log: HandLog) -> list[GoalResult]:
                 success=None
                 if error is None
                 else outcome == "stopped" and error <= log.tolerance_rad,
+                turned=turned,
             )
         )
     return results
 
 
+def revolutions(quat: np.ndarray, axis: Sequence[float]) -> float:
+    """Turns about an axis, world frame, of orientations xyzw one after the other [T, 4]."""
+    turns = Rotation.from_quat(quat)
+    moved = (turns[1:] * turns[:-1].inv()).as_rotvec().sum(axis=0)
+    return float(moved @ axis / (np.linalg.norm(axis) * 2.0 * np.pi))
+
+
 def summary_line(results: Sequence[GoalResult], goals: int) -> str:
-    """How many goals were reached of those that were to be pursued."""
+    """How many goals were reached of those that were to be pursued, or how far what spins turned."""
+    turns = [result.turned for result in results if result.turned is not None]
+    if turns:
+        return f"{sum(turns):.2f} revolutions"
     if any(result.success is None for result in results):
         stopped = sum(result.outcome == "stopped" for result in results)
         return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors"

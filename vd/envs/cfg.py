@@ -33,6 +33,33 @@ class ActionCfg:
 
 
 @dataclass(frozen=True)
+class SpinCfg:
+    """Ours: turn about an axis without a goal, with the terms of HORA (arXiv 2210.04887).
+
+    Off by default. Its work is ``energy``, which is linear.
+    """
+
+    rate: float = 0.0
+    """Times the speed about the axis [s/rad]; 0: there are goals."""
+    axis: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    """About which, in the world; the default is clockwise from above, as in HORA."""
+    clip_rad_s: float = 1.0
+    """Speed about it from which more is worth nothing [rad/s]; HORA: 0.5."""
+    object_speed: float = -0.3
+    """Times the sum of the absolute components of the object's velocity [s/m]."""
+    posture: float = -0.02
+    """Times the summed squared distance of the joints from their start [1/rad^2]; HORA: -0.3."""
+    torque: float = -0.1
+    """Times the summed squared torque of the joints [1/(N m)^2]."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        require(self, "reward.spin.", "positive", "clip_rad_s")
+        if not any(self.axis):
+            raise ValueError("reward.spin.axis is 0 0 0; give a direction, such as 0 0 1")
+
+
+@dataclass(frozen=True)
 class RewardCfg:
     """Coefficients of equations 1-5, 7 and 8, and of our own shaping (off by default)."""
 
@@ -62,6 +89,8 @@ class RewardCfg:
     """
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
+    spin: SpinCfg = field(default_factory=SpinCfg)
+    """Ours: in place of goals."""
     terms: MutableMapping[str, float] = field(default_factory=dict)
     """Your own terms: functions (module:function) with their coefficients
     (docs/tutorials/terms.md).
@@ -134,6 +163,9 @@ class ObservationCfg:
     backlash of joints, frictions, mass, latency), and the present state and shape, without
     noise.
     """
+    history: int = 0
+    """Ours: of how many control steps the policy sees joint positions and actions, and nothing
+    else; the critic sees all of the rest. 0: it sees the state."""
     terms: MutableMapping[str, int] = field(default_factory=dict)
     """Your own values: functions (module:function), and how many values each gives. Symmetry frames
     show them as they are, without latency and noise."""
@@ -516,6 +548,12 @@ class ReorientCfg:
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()
+        self.reward.spin.validate()
+        require(self.observation, "observation.", "zero or positive", "history")
+        if self.observation.history and self.observation.view != "world":
+            raise ValueError(
+                "observation.history knows no goal to turn the view to; leave observation.view world"
+            )
         require(self.start, "start.", "in [0, 1]", "reached_share")
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")

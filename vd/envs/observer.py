@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from vd.envs.history import JointHistory
 from vd.envs.latency import SeenState
 from vd.envs.parts import actor_size, observation_parts
 from vd.envs.pose_error import PoseError
@@ -44,6 +45,7 @@ class Observer:
         self.seen = SeenState(state)
         self._tracked_pose = TrackedPose(state, self.seen)
         self._pose_error = PoseError(state)
+        self._history = JointHistory(state, self.parts)
         width = max(columns.stop for columns in self.parts.values())
 
         zeros = state.zeros
@@ -90,6 +92,7 @@ class Observer:
         self.seen.begin(mask)
         self._tracked_pose.begin(mask)
         self._pose_error.begin(mask)
+        self._history.begin(mask)
 
     def observe(self) -> None:
         """Write the observation of the present state. Device work only."""
@@ -98,7 +101,8 @@ class Observer:
         self.seen.recall()
         seen = self._pose_error.apply(self._tracked_pose.hold(self.seen.arrays))
         noise = state.parameters.observation, self._drawn.observation_offset, state.rng
-        self._observe_state(seen, noise, self.world_values)
+        self._observe_state(seen, noise, self.world_values[:, self.parts["state"].start :])
+        self._history.push(self.world_values)
         if "present" in self.parts:
             sim = state.sim
             true = [sim.joint_q, sim.joint_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
@@ -139,7 +143,7 @@ class Observer:
         if "shape" in self.parts:
             assert self.shapes is not None
             _, _, joint_q, _, body_q, _ = seen
-            first = self.parts["shape"].start
+            first = self.parts["shape"].start - self.parts["state"].start
             self.shapes.observe(joint_q, state.num_joints, body_q, state.goal_quat, out, first)
 
     def _tell(self) -> None:

@@ -22,6 +22,8 @@ STILLNESS_START = 12.0
 keep."""
 GOAL_START_RAD = 1.0
 """Largest goal angle at level 0 of goals [rad] (ours)."""
+NO_GOAL = -1.0
+"""Rotation error that no object reaches [rad]: what spins has no goal to end at."""
 LIFT_M = 0.02
 """Height from which more is worth nothing [m]; as far as a finger can give way without a fall."""
 
@@ -139,7 +141,9 @@ class TaskParameters:
         )
         self._write(
             "success",
-            rotation=blend(loose.rotation_rad, success.rotation_rad, levels.stillness),
+            rotation=NO_GOAL
+            if reward.spin.rate
+            else blend(loose.rotation_rad, success.rotation_rad, levels.stillness),
             joint_speed=threshold(success.joint_speed_rad_s, loose.joint_speed_rad_s),
             object_speed=threshold(success.object_speed_m_s, loose.object_speed_m_s),
             object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),

@@ -10,13 +10,14 @@ from vd.kernels.task.shapes import shape_observation_size, shape_observation_sli
 def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
-    state, shape, terms (own values), dynamics, present (state and shape without latency and noise),
-    critic_terms; parts that are off are missing.
+    history, state, shape, terms (own values), dynamics, present (state and shape without latency
+    and noise), critic_terms; parts that are off are missing.
     """
     told = cfg.dynamics != "none"
     state = teacher_observation_size(fingers, joints)
     shape = shape_observation_size(fingers) if cfg.shape != "none" else 0
     sizes = {
+        "history": 2 * joints * cfg.history,
         "state": state,
         "shape": shape,
         "terms": sum(cfg.terms.values()),
@@ -44,15 +45,17 @@ def observation_columns(cfg: ObservationCfg, fingers: int, joints: int) -> dict[
     }
     for part, where in parts.items():
         for name, within in inside.get(part, {part: slice(0, where.stop - where.start)}).items():
-            told = "critic/" if part in CRITIC_ALONE else ""
+            told = "critic/" if where.start >= actor_size(parts) else ""
             columns[told + name] = slice(where.start + within.start, where.start + within.stop)
     return columns
 
 
 CRITIC_ALONE = ("dynamics", "present", "critic_terms")
-"""Parts that the actor does not read, the last of all."""
+"""Parts that the actor does not read, the last of all. With a history it reads nothing else."""
 
 
 def actor_size(parts: dict[str, slice]) -> int:
     """Values that the actor reads, the first of all."""
+    if "history" in parts:
+        return parts["history"].stop
     return max(columns.stop for name, columns in parts.items() if name not in CRITIC_ALONE)

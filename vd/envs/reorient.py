@@ -19,6 +19,7 @@ from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.reached_starts import ReachedStarts
 from vd.envs.saved_state import load_arrays, save_state, saved_levels
+from vd.envs.spin import Spin
 from vd.envs.starts import FreeStarts
 from vd.envs.task_state import build_task
 from vd.kernels.rng import init_rng_kernel
@@ -27,6 +28,7 @@ from vd.kernels.task.environments import keep_object_pose_kernel
 from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
+from vd.kernels.task.spin import SPIN_TERMS
 from vd.kernels.task.success import success_kernel
 from vd.sim.graphs import Graphs
 from vd.sim.simulator import CHECKED
@@ -109,7 +111,8 @@ class ReorientEnv:
         self.num_actions = len(self.hand.actuated)
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
-        self.reward_term_names = (*REWARD_TERMS, *cfg.reward.terms)
+        spun = SPIN_TERMS if cfg.reward.spin.rate else ()
+        self.reward_term_names = (*REWARD_TERMS, *spun, *cfg.reward.terms)
 
         self._allocate()
         self._lifts = cfg.reward.lift != 0.0
@@ -153,6 +156,10 @@ class ReorientEnv:
         self.action = zeros(n, self.num_actions)
         self.reward = zeros(n)
         self.reward_terms = zeros(n, len(self.reward_term_names))
+        self.spin: Spin | None = None
+        """Measures how far objects turn; None where they have goals."""
+        if self.cfg.reward.spin.rate:
+            self.spin = Spin(self.state, len(REWARD_TERMS))
         self.rotation_error = zeros(n)
         self.still = zeros(n, dtype=wp.int32)
         """1 where all of success holds but the rotation's threshold, shape [N]."""
@@ -204,6 +211,8 @@ class ReorientEnv:
             for _ in range(round(SETTLE_S * self.cfg.sim.control_hz)):
                 wp.copy(self.sim.target, self.sim.joint_q)
                 self.sim.step()
+            if self.cfg.failures_per_million > 0.0:  # what failed lies nowhere
+                self.sim.failures.zero_()
             self.check()
             dropped.append(self.object_pose())
         landed = np.stack(dropped, axis=1)
@@ -438,6 +447,8 @@ class ReorientEnv:
             ],
             [self.reward, self.reward_terms],
         )
+        if self.spin is not None:
+            self.spin.pay(self.reward, self.reward_terms)
         if self.cfg.failures_per_million > 0.0:
             self._launch(
                 void_step_kernel,
@@ -502,6 +513,8 @@ class ReorientEnv:
         if sim.servo is not None:
             sim.servo.reset(reset)
         self.observer.begin(self.ended)
+        if self.spin is not None:
+            self.spin.begin(self.ended)
 
     def observe(self) -> None:
         """Refresh the observation from the present state.

@@ -14,7 +14,6 @@ import warp as wp
 
 from vd.command.functions import named_function
 from vd.envs.cfg import ReorientCfg
-from vd.kernels.task.rewards import REWARD_TERMS
 from vd.sim.simulator import CHECKED
 
 
@@ -51,7 +50,8 @@ class OwnTerms:
         reward = wp.to_torch(env.reward)
         terms = wp.to_torch(env.reward_terms)
         failed = wp.to_torch(env.sim.failed) > 0
-        for column, (name, coefficient) in enumerate(self._coefficients.items(), len(REWARD_TERMS)):
+        first = len(env.reward_term_names) - len(self._coefficients)
+        for column, (name, coefficient) in enumerate(self._coefficients.items(), first):
             paid = (coefficient * self._value(env, name, 1)[:, 0]).masked_fill(failed, 0.0)
             terms[:, column] = paid
             reward += self._scale * paid

@@ -119,6 +119,9 @@ class EvalCfg(HandFlags, EpisodeFlags):
     as a second row, at the first step at which all success criteria of training hold, stillness
     included.
 
+    Policies that turn objects without a goal (leap-spin) are judged by their turns in 30 s and
+    their drops, in spin.json.
+
     --suite paper runs all of the paper's evaluations in simulation and writes paper.json and
     paper.html, its figures beside ours. --suite robust changes one thing after the other and writes
     robust.json and robust.html. What is finished is not repeated by the next call.

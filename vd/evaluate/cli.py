@@ -37,8 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(cfg: EvalCfg) -> int:
     from vd.evaluate.compare import compare
     from vd.evaluate.page import terminal_text, write_page
+    from vd.evaluate.spin import SPIN_FILE, any_spins, evaluate_spin
     from vd.evaluate.suite_run import run_suite
 
+    if any_spins(cfg):
+        print(f"{evaluate_spin(cfg).text()}\n{cfg.out / SPIN_FILE}")
+        return 0
     written = cfg.out / f"{cfg.suite_name}.json"
     page = cfg.out / f"{cfg.suite_name}.html"
     if cfg.suite is None:

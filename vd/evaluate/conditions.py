@@ -76,6 +76,16 @@ _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
         "Table S3, friction, backlash, late commands, late object",
         _MIXED,
     ),
+    "hora": (
+        "sizes, masses, centres of mass and frictions about as HORA draws them, and Table S3",
+        RandomisationCfg(
+            friction=(0.3, 3.0),
+            object_mass_kg=(0.01, 0.25),
+            object_scale=(0.8, 1.2),
+            object_scale_count=5,
+            object_com_m=OFF_CENTRE_M,
+        ),
+    ),
     "tracked": (
         "object seen by a tracker: late, 10 to 30 Hz, gaps and jumps",
         _only(tracked_pose=TRACKED_POSE),

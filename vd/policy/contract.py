@@ -303,10 +303,12 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     observation = task.observation
     slices = teacher_observation_slices(hand.num_fingers, hand.num_joints)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
-    if observation.shape != "none":
+    if observation.history:
+        parts = {"history": (0, 2 * hand.num_joints * observation.history)}
+    elif observation.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
-    if observation.terms:
+    if observation.terms and not observation.history:
         end = max(last for _, last in parts.values())
         parts["terms"] = (end, end + sum(observation.terms.values()))
     return {
