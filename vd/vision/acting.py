@@ -1,6 +1,7 @@
 """Students at work: what they believe and remember from step to step, in a simulator or on a robot."""
 
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Literal
 
 import torch
@@ -108,7 +109,7 @@ class ActingStudent:
         starts = len(self._starts)
         for some in rows.split(max(1, AT_ONCE // starts)):
             every = some.repeat_interleave(starts)
-            now = each(senses, lambda value, every=every: value[every])
+            now = each(senses, itemgetter(every))
             goal = self.build.goal_rotation(senses.goal_quat[some])
             rotation = self._starts @ goal[:, None]
             position = senses.points[some].nanmean(dim=1)
