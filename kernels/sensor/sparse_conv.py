@@ -5,6 +5,8 @@ A cell of level l is a cube of 2^l voxels a side. Its key is that of its first v
 coordinates count voxels, and one kernel makes every map between levels.
 """
 
+from typing import Any
+
 import warp as wp
 
 from vd.kernels.sensor.voxels import CLOUD_SHIFT, key_coordinates, voxel_key
@@ -93,3 +95,16 @@ def voxel_feature_kernel(
     feature_out[row, 4 * kind] = wp.min(count, 1.0)
     for axis in range(3):
         feature_out[row, 4 * kind + 1 + axis] = total[axis] / wp.max(count, 1.0)
+
+
+@wp.kernel
+def gather_rows_kernel(
+    # In:
+    rows_in: wp.array2d[Any],  # [F, W] rows of words
+    table_in: wp.array[int],  # [E] rows to take
+    # Out:
+    rows_out: wp.array2d[Any],  # [E, W] these rows
+):
+    """Copy rows, a thread for each word. Launch: [E, W]."""
+    entry, word = wp.tid()
+    rows_out[entry, word] = rows_in[table_in[entry], word]

@@ -3,13 +3,21 @@
 import itertools
 
 import numpy as np
+import pytest
+import torch
+import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from kernel_oracle import EXAMPLES, launch
 
-from vd.kernels.sensor.sparse_conv import kernel_map_kernel, voxel_feature_kernel
+from vd.kernels.sensor.sparse_conv import (
+    gather_rows_kernel,
+    kernel_map_kernel,
+    voxel_feature_kernel,
+)
 from vd.kernels.sensor.voxels import CLOUD_SHIFT, coordinates_kernel, voxel_key_kernel
+from vd.vision.sparse import words
 
 FAR = 2047
 """Last voxel of the grid."""
@@ -91,3 +99,21 @@ def test_features_are_of_the_points_in_the_given_order(device):
     expected = [[0, 0, 0, 0, 1, 0, -0.5, -0.5], [1, 0, 0, 0, 1, -0.25, -0.25, -0.25]]
     np.testing.assert_allclose(features, expected, atol=1e-6)
     assert CLOUD_SHIFT == 36
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("channels", [15, 30, 32])
+def test_rows_are_taken_bit_by_bit(device, channels, dtype):
+    """Of floats and halves, in words of each size."""
+    random = np.random.default_rng(0)
+    place = torch.device(wp.device_to_torch(device))
+    rows = torch.tensor(random.normal(size=(20, channels)), device=place).to(dtype)
+    table = random.integers(0, 20, 50).astype(np.int32)
+    taken = torch.full((50, channels), torch.nan, device=place).to(dtype)
+    source = words(rows)
+    inputs = [source, wp.array(table, device=device)]
+    wp.launch(
+        gather_rows_kernel, (50, source.shape[1]), inputs, outputs=[words(taken)], device=device
+    )
+    found = taken.float().cpu().numpy()
+    np.testing.assert_array_equal(found, rows.float().cpu().numpy()[table])
