@@ -155,7 +155,11 @@ def test_unknown_set_says_what_there_is(
         load_set(tmp_path / "empty")
     with pytest.raises(ObjectError, match=r"empty: no object file"):
         sets.check_sets([tmp_path / "empty"])
-    with pytest.raises(ObjectError, match="cube is also in"):
-        load_set(["cube", "symmetric"])
+    names = [item.name for item in load_set(["cube", "symmetric"])]
+    assert names[0] == "cube" and "cube-symmetric" in names and len(set(names)) == len(names)
+    for folder in ("one/cube", "two/cube"):
+        sets.write_set(tmp_path / folder, load_set("cube"))
+    with pytest.raises(ObjectError, match="two objects cube-cube; leave one out"):
+        load_set(["cube", tmp_path / "one/cube", tmp_path / "two/cube"])
     with pytest.raises(ObjectError, match="no object set was named"):
         load_set([])

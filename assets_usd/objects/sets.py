@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -162,23 +163,27 @@ def set_files(names_or_paths: Iterable[str | Path]) -> list[Path]:
 def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectModel]:
     """Load objects: files, folders of files, or names of sets, in the order given.
 
+    Of two that are called alike the second is called after its folder too: hammer-ycb.
+
     Args:
         names_or_paths: One entry or several. A name stands for a built-in set (``cube``,
             ``cuboid``, ``symmetric``, ``procedural-150-seed0``, ``procedural-heldout``), authored
             into the asset cache on first use, or for an imported set's folder there.
 
     Raises:
-        ObjectError: An entry is neither, a folder holds no object, or two objects share a name.
+        ObjectError: An entry is neither, a folder holds no object, or two objects share the name of
+            their folder, too.
     """
     files = set_files(
         [names_or_paths] if isinstance(names_or_paths, str | Path) else names_or_paths
     )
-    models = [read_object(path) for path in files]
-    files_by_name: dict[str, Path] = {}
-    for model, path in zip(models, files, strict=True):
-        if model.name in files_by_name:
-            raise ObjectError(
-                f"{path}: object {model.name} is also in {files_by_name[model.name]}; leave one out"
-            )
-        files_by_name[model.name] = path
-    return models
+    models: dict[str, ObjectModel] = {}
+    for path in files:
+        model = read_object(path)
+        name = model.name
+        if name in models:
+            name = f"{name}-{path.parent.name}"
+        if name in models:
+            raise ObjectError(f"{path}: there are two objects {name}; leave one out")
+        models[name] = replace(model, name=name)
+    return list(models.values())
