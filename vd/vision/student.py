@@ -161,10 +161,10 @@ def rigid_motion(flow: Flow, looks: int) -> tuple[Tensor, Tensor]:
     Returns:
         Rotations [R, 3, 3], and translations [m] [R, 3]: q ~ R p + t.
     """
+    lengths = torch.bincount(flow.look, minlength=looks)
 
     def total(values: Tensor) -> Tensor:
-        shape = looks, *values.shape[1:]
-        return values.new_zeros(shape).index_add(0, flow.look, values)
+        return torch.segment_reduce(values, "sum", lengths=lengths, unsafe=True)
 
     weight = torch.exp(-2.0 * flow.log_scale)
     weight = weight / total(weight)[flow.look]
@@ -173,7 +173,8 @@ def rigid_motion(flow: Flow, looks: int) -> tuple[Tensor, Tensor]:
     to_middle = total(weight[:, None] * end)
     start = flow.start - from_middle[flow.look]
     end = end - to_middle[flow.look]
-    covariance = total(weight[:, None, None] * end[:, :, None] * start[:, None, :])
+    products = weight[:, None, None] * end[:, :, None] * start[:, None, :]
+    covariance = total(products.flatten(1)).unflatten(1, (3, 3))
     still = LEAST_M**2 * torch.eye(3, device=covariance.device)
     left, _, right = torch.linalg.svd(covariance + still)
     signs = torch.ones_like(to_middle)
@@ -376,9 +377,9 @@ class Student(nn.Module):
             rotation=torch.where(blind[..., None], believed.rotation, rotation),
             position=torch.where(blind, believed.position, position),
         )
-        count = torch.bincount(flow.look, minlength=looks)
-        summed = count.new_zeros(looks, dtype=place.dtype).index_add(0, flow.look, flow.log_scale)
-        return Look(self.project(pooled), better, summed / count, seen, flow)
+        of_look = torch.bincount(flow.look, minlength=looks)
+        doubt = torch.segment_reduce(flow.log_scale, "mean", lengths=of_look, unsafe=True)
+        return Look(self.project(pooled), better, doubt, seen, flow)
 
     def _convolve(self, voxels: SparseTensor) -> list[SparseTensor]:
         """Features of the cells of each stage."""
