@@ -230,10 +230,8 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
     run(tmp_path, TEACHER, CAMERA, suite="robust", objects=("held-out=cube",))
     of_state = {"observation-late", "all-late", "pose-error", "tracked", "mixed-tracked"}
     names = [c.name for c in ROBUST]
-    of_table = set(get_args(Condition)) - {
-        "hora"
-    }  # hora is of spins, which vd.evaluate.spin judges
-    assert set(names) == of_table | {"air-nominal", "air-mixed"} and names[0] == "nominal"
+    of_goals = set(get_args(Condition)) - {"hora"}  # under which objects are spun
+    assert set(names) == {*of_goals, "air-nominal", "air-mixed"} and names[0] == "nominal"
     assert {n for n, policy in asked if policy == CAMERA} == set(names) - of_state
     assert {n for n, policy in asked if policy == TEACHER} == set(names)
     table = json.loads((tmp_path / "out" / "robust.json").read_text())["figures"]
