@@ -210,7 +210,7 @@ class RosHand(FaultlessMotors):
 class RosGoals:
     """Goals that others give while a hand is driven.
 
-    Also a sink of the log, whose events it publishes.
+    It also publishes the log's events.
     """
 
     def __init__(self, node: Any, goals: list[np.ndarray]):
@@ -248,15 +248,9 @@ class RosGoals:
         answer.message = "ends after the last goal"
         return answer
 
-    def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
-        """Steps are not published."""
-
     def event(self, line: Mapping[str, Any]) -> None:
         """Publish an event."""
         self._events.publish(self._string(data=json.dumps(line)))
-
-    def close(self, run: Mapping[str, Any]) -> None:
-        """The node goes on."""
 
 
 @contextlib.contextmanager

@@ -85,13 +85,13 @@ def test_a_file_that_cannot_be_used_is_refused_by_name(line, text, tmp_path, run
 def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     path = tmp_path / "run.yaml"
     path.write_text(
-        "objects: [cuboid]\nin_air: true\nquick: true\ntable_friction: 3e-1\npolicies: [random]"
+        "objects: [cuboid]\nin_air: true\nair_goals: true\ntable_friction: 3e-1\npolicies: [random]"
     )
     values = yaml.safe_load(
-        run(f"vd-eval zero --config={path} --in-air --no-quick --print-config")[1]
+        run(f"vd-eval zero --config={path} --in-air --no-air-goals --print-config")[1]
     )
     assert values["policies"] == ["zero"] and values["objects"] == ["cuboid"]
-    assert values["in_air"] and not values["quick"] and values["table_friction"] == 0.3
+    assert values["in_air"] and not values["air_goals"] and values["table_friction"] == 0.3
 
     path.write_text("preset: cpu-demo\nppo: {epochs: 3}\nrun: {out: a}\nenv: {hand: dclaw4}")
     cfg, preset = (

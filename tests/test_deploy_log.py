@@ -23,7 +23,6 @@ from vd.logs.log_format import (
     TRUTH_COLUMNS,
     LogError,
 )
-from vd.logs.mcap_log import McapLog
 from vd.logs.recording import read_recording
 from vd.play.cli import main as play
 from vd.play.render import OUT_OF_SIGHT
@@ -45,18 +44,14 @@ def folder(tmp_path):
         "tolerance_rad": 1.0,
     }
     log = LogWriter(tmp_path / "log", hand, run, servo={"p_gain": 200}, truth=True, clock=clock)
-    log.also_to(McapLog(tmp_path / "log.mcap", log.run, np.array(hand.workspace.goal_m)))
     for step in range(STEPS):
         wave = 0.3 * np.sin(0.5 * step + np.arange(9))
         joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
         values = [float(step >= 10), 1.0, 0.5, 0.001, -0.03, 0.002, 0.02, 0.02, 0.0]
         assert len(values) == len(STEP_COLUMNS)
         now = clock.now()
-        truth, depth = (
-            [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step],
-            np.full((2, 3), 0.5, np.float32),
-        )
-        log.step(now, now + SENT_S, joints, values, truth, [0.1 * step] * 7, depth)
+        truth = [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step]
+        log.step(now, now + SENT_S, joints, values, truth, [0.1 * step] * 7)
         if step == 9:
             log.event("stop", goal=0, outcome="stopped", distance=0.2)
         clock.sleep(1 / 12)
@@ -77,35 +72,6 @@ def test_what_is_written_is_read(folder):
     assert (first.outcome, second.outcome) == ("stopped", "lost")
     assert second.goal_quat == tuple(GOALS[1])
     assert len(TRUTH_COLUMNS) == 8
-
-
-def test_the_mcap_beside_it_has_ros_2_messages_for_others(folder):
-    reader = pytest.importorskip("mcap.reader")
-    from mcap_ros2.decoder import DecoderFactory
-
-    log, file = read_log(folder), folder.with_suffix(".mcap")
-    with file.open("rb") as stream:
-        whole = reader.make_reader(stream, decoder_factories=[DecoderFactory()])
-        (run,) = whole.iter_metadata()
-        told = list(whole.iter_decoded_messages())
-    assert json.loads(run.metadata["json"]) == log.run
-    topics = [channel.topic for _, channel, _, _ in told]
-    assert topics.count("/goal_pose") == topics.count("/found_pose") == STEPS
-    assert topics.count("/depth") == 3
-    states = [message for _, channel, _, message in told if channel.topic == "/joint_states"]
-    for channel in ("position", "velocity"):
-        values = [getattr(state, channel) for state in states]
-        np.testing.assert_allclose(values, log.channel(channel), atol=1e-6)
-    events = [message.data for _, channel, _, message in told if channel.topic == "/events"]
-    assert list(map(json.loads, events)) == log.events
-    depth = told[topics.index("/depth")][3]
-    assert (depth.encoding, depth.height, depth.width) == ("16UC1", 2, 3)
-    assert np.frombuffer(depth.data, "<u2").tolist() == [500] * 6
-    pose = told[topics.index("/object_pose")][3]
-    assert pose.header.frame_id == "world" and (pose.pose.position.z, pose.pose.orientation.w) == (
-        0.03,
-        1.0,
-    )
 
 
 def test_a_log_is_shown(folder, tmp_path, capsys):

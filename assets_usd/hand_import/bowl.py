@@ -79,11 +79,10 @@ class Drops:
         self._data = mujoco.MjData(self._model)
         fingers = dict(zip(hand.joint_child.tolist(), hand.joint_finger.tolist(), strict=True))
         of_geom = [fingers.get(link, -1) for link in self._model.geom_bodyid - 1]
-        pairs = [
-            (a, b)
-            for a, b in combinations(range(len(hand.shapes)), 2)
-            if -1 < of_geom[a] != of_geom[b] > -1
-        ]
+        pairs = []
+        for a, b in combinations(range(len(hand.shapes)), 2):
+            if -1 < of_geom[a] != of_geom[b] > -1:
+                pairs.append((a, b))
         self._pairs = np.array(pairs, dtype=int).reshape(-1, 2)
         """Geoms of two fingers; bodies and geoms of the hand come first, in the order of links."""
 
@@ -174,8 +173,9 @@ def find_bowl(hand: HandModel, place: Callable[[np.ndarray], tuple[np.ndarray, W
         finally:
             free.put(own)
 
-    best, (value, kept) = hand.start, score(hand.start)
-    before = kept
+    best = hand.start
+    value, before = score(best)
+    kept = before
     with ThreadPoolExecutor(THREADS) as pool:
         for _ in range(ROUNDS):
             drawn = middle + spread * rng.standard_normal((POSES, hand.num_joints))

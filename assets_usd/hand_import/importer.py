@@ -92,11 +92,12 @@ def import_hand(
         near = _untouched(source, tree)
         deep = overlaps(read_hand(author.write(Path(scratch), near)), near)
         target = author.write(Path(scratch), near | deep.keys())
-        warnings += [
-            f"{tree.links[first].name} and {tree.links[second].name} are {1e3 * depth:.1f} mm in each "
-            "other at the start; their contact is off, unless another start keeps them apart"
-            for (first, second), depth in sorted(deep.items())
-        ]
+        for (first, second), depth in sorted(deep.items()):
+            pair = f"{tree.links[first].name} and {tree.links[second].name}"
+            warnings.append(
+                f"{pair} are {1e3 * depth:.1f} mm in each other at the start; their contact is "
+                "off, unless another start keeps them apart"
+            )
         warnings += _replaced(folder / target.name, source)
         make_folder(folder)
         for file in Path(scratch).iterdir():
@@ -162,11 +163,12 @@ def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
 
 def _unnamed(source: Source, describe: str | Path | None) -> list[str]:
     """What is said of a hand that comes without the description which the package has of it."""
+    name = source.name.removesuffix("_right")
+    if describe is not None or name not in BUILT_IN or name == source.name:
+        return []
     return [
         f"policies and presets know this hand as {name}, with what its file does not say: import "
         f"it with --describe {name}"
-        for name in BUILT_IN
-        if describe is None and source.name == f"{name}_right"
     ]
 
 

@@ -52,7 +52,7 @@ def mean_width(vertices: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class Fit:
+class SizeLimits:
     """Sizes of objects that fit a hand [m]."""
 
     longest: tuple[float, float] = LONGEST_SIDE_M
@@ -64,7 +64,7 @@ class Fit:
 
 
 @cache
-def fit_of(hand: str) -> Fit:
+def fit_of(hand: str) -> SizeLimits:
     """Sizes that fit a hand: its longest sides, and of a D'Claw's bounds as large a share.
 
     Args:
@@ -77,14 +77,16 @@ def fit_of(hand: str) -> Fit:
 
     least, most = load_hand(hand).workspace.size_m
     share = most / LONGEST_SIDE_M[1]
-    return Fit((least, most), share * MEAN_WIDTH_M, share * THINNEST_M)
+    return SizeLimits((least, most), share * MEAN_WIDTH_M, share * THINNEST_M)
 
 
-DCLAW = Fit()
+DCLAW = SizeLimits()
 """Sizes of the paper's hand."""
 
 
-def scales_that_fit(sides: Sequence[float], width: float, fit: Fit = DCLAW) -> tuple[float, float]:
+def scales_that_fit(
+    sides: Sequence[float], width: float, fit: SizeLimits = DCLAW
+) -> tuple[float, float]:
     """Least and largest factor to metres by which a shape fits a hand.
 
     A shape that fits at no size has a least factor above the
@@ -152,7 +154,7 @@ def unit_name(unit: float) -> str:
 
 
 def choose_scale(
-    sides: Sequence[float], width: float, unit: float | None = None, fit: Fit = DCLAW
+    sides: Sequence[float], width: float, unit: float | None = None, fit: SizeLimits = DCLAW
 ) -> tuple[float, str]:
     """Factor from a mesh's units to metres, so that it fits a hand.
 

@@ -63,10 +63,11 @@ def check_set_folder(folder: Path) -> None:
 def _built_in_models(name: str) -> list[ObjectModel]:
     from vd.assets_usd.objects.procedural import cube, cuboid, cylinder, procedural_set
 
-    if name == "cylinder":
-        return [cylinder()]
-    if name in ("cube", "cuboid", "symmetric"):
-        return [make() for make in (cube, cuboid) if name in (make.__name__, "symmetric")]
+    if name == "symmetric":
+        return [cube(), cuboid()]
+    for make in (cube, cuboid, cylinder):
+        if name == make.__name__:
+            return [make()]
     match = _PROCEDURAL.fullmatch(name)
     if match is None:
         return procedural_set(HELD_OUT_COUNT, 0, families="heldout")

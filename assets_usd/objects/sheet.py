@@ -79,8 +79,10 @@ def _caption(model: ObjectModel) -> str:
     facts = (
         f"{model.longest_side * 1e3:.0f} mm, parts: {len(model.hulls)}, ±{model.volume_error:.1%}"
     )
-    said = [model.name, facts, *model.warnings]
-    return "\n".join(line for text in said for line in _lines(text, CAPTION_POINTS, 2 * TILE_IN))
+    lines: list[str] = []
+    for text in (model.name, facts, *model.warnings):
+        lines += _lines(text, CAPTION_POINTS, 2 * TILE_IN)
+    return "\n".join(lines)
 
 
 def save_figure(figure: Any, path: Path) -> Path:

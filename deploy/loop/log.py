@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -37,22 +37,7 @@ from vd.logs.recording import COMMAND_TIME
 from vd.logs.recording import FORMAT as RECORDING_FORMAT
 
 DIGITS = 6
-DEPTH_STEPS = 12
-"""Control steps from one depth image that is logged to the next: a second."""
 NOWHERE = (float("nan"),) * len(FOUND_COLUMNS)
-
-
-class Sink(Protocol):
-    """What else a run is written to; each call comes from the log's thread."""
-
-    def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
-        """A control step, by columns of steps.csv; now and then with its depth image [m] [H, W]."""
-
-    def event(self, line: Mapping[str, Any]) -> None:
-        """An event, as of events.jsonl."""
-
-    def close(self, run: Mapping[str, Any]) -> None:
-        """The run has ended; ``run`` is what run.json says."""
 
 
 class LogWriter:
@@ -107,8 +92,7 @@ class LogWriter:
                 {"file": STEPS_FILE, "excitation": "policy", "joints": list(hand.joint_names)}
             ],
         }
-        self._sinks: list[Sink] = []
-        self._count = 0
+        self._hear: Callable[[Mapping[str, Any]], object] | None = None
         self._channels = [channel for channel in JOINT_CHANNELS if channel not in without]
         self._columns = [
             "t",
@@ -127,9 +111,9 @@ class LogWriter:
         write_json(folder / RECORDING_FILE, recording)
         write_json(folder / RUN_FILE, self.run)
 
-    def also_to(self, sink: Sink) -> None:
-        """Write to a sink too."""
-        self._sinks.append(sink)
+    def also_to(self, hear: Callable[[Mapping[str, Any]], object]) -> None:
+        """Give events, as of events.jsonl, to others too; the calls come from the log's thread."""
+        self._hear = hear
 
     def since(self, time_s: float) -> float:
         """Seconds from the start of the log to a time of the monotonic clock."""
@@ -143,7 +127,6 @@ class LogWriter:
         values: Sequence[float],
         truth: Sequence[float] = (),
         found: Sequence[float] = NOWHERE,
-        depth: np.ndarray | None = None,
     ) -> None:
         """Append a control step.
 
@@ -154,7 +137,6 @@ class LogWriter:
             values: In the order of STEP_COLUMNS.
             truth: In the order of TRUTH_COLUMNS, if they are logged.
             found: In the order of FOUND_COLUMNS.
-            depth: The depth image that was seen [m] [H, W]; sinks get some of them.
         """
         row = [
             self.since(time_s),
@@ -165,11 +147,6 @@ class LogWriter:
             *truth,
         ]
         self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
-        if self._sinks:
-            image = depth.copy() if depth is not None and self._count % DEPTH_STEPS == 0 else None
-            values_by_name = dict(zip(self._columns, map(float, row), strict=True))
-            self._tell(lambda sink: sink.step(values_by_name, image))
-        self._count += 1
 
     def goal(self, number: int, goal: np.ndarray) -> None:
         """A goal [4] is begun; one that was not known when the log began is noted first."""
@@ -184,7 +161,8 @@ class LogWriter:
         """Append an event of this moment."""
         line = {"t": round(self.since(self._clock.now()), DIGITS), "event": event, **values}
         self._append(self._events, json.dumps(line))
-        self._tell(lambda sink: sink.event(line))
+        if self._hear is not None:
+            self._later(partial(self._hear, line))
 
     def stopped(self, report: StopReport) -> None:
         """The hand was stopped; with the motors that may still have their torque on, by ID."""
@@ -199,7 +177,6 @@ class LogWriter:
         """
         self.event("end", reason=reason)
         run = {**self.run, "end": {"reason": reason, **summary}}
-        self._tell(lambda sink: sink.close(run))
         self._writer.shutdown()
         os.close(self._steps)
         os.close(self._events)
@@ -209,11 +186,6 @@ class LogWriter:
     def _append(self, file: int, line: str) -> None:
         data = line.encode() + b"\n"
         self._later(lambda: os.write(file, data))  # one call: whole, or not at all
-
-    def _tell(self, say: Callable[[Sink], None]) -> None:
-        """Have the thread tell all sinks."""
-        for sink in self._sinks:
-            self._later(partial(say, sink))
 
     def _later(self, do: Callable[[], object]) -> None:
         """Have the thread do something."""

@@ -272,7 +272,7 @@ class ControlLoop:
             pose = sensed.object_state[:7]
         found_pose = NOWHERE if pose is None else pose.tolist()
         sent_s = self._pacer.due_s + times.sent_s
-        self._log.step(state.time_s, sent_s, joints, values, truth, found_pose, sensed.depth)
+        self._log.step(state.time_s, sent_s, joints, values, truth, found_pose)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
             doing = f"distance {decision.distance:.2f} rad" if acting else "holding"

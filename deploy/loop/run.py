@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from vd.command import interrupt
 from vd.command.config import require
 from vd.command.files import check_folder
 from vd.command.line import say_same_as
@@ -33,7 +32,7 @@ from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import MOVE_S, SafeHand
 from vd.deploy.timely import undisturbed
 from vd.logs.hand_log import is_log, read_log
-from vd.logs.log_format import MCAP, LogError
+from vd.logs.log_format import LogError
 from vd.paper import PAPER
 from vd.policy.agents import check_names, default_policy
 
@@ -114,8 +113,7 @@ class DriveCfg(HandOptions):
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
-    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) is
-    written beside the folder NAME."""
+    """Folder of the log; runs/deploy/ and the time by default."""
     ros2: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Drive a hand behind ROS 2 in place of --port. Goals come from a service too
     (vd.deploy.ros).
@@ -169,10 +167,6 @@ class DriveCfg(HandOptions):
         if Path(self.object).suffix.lower() in SCAN_SUFFIXES and (self.twin or self.pose):
             who = "a twin cannot hold" if self.twin else "a teacher does not know"
             raise ValueError(f"--object {self.object}: {who} a scan; vd-assets import it first")
-        if self.log is not None and self.log.suffix == MCAP:
-            if self.log.exists():
-                raise FileExistsError(f"--log {self.log} is there; choose another name")
-            interrupt.need("mcap_ros2", "rosbags")
 
 
 def run(cfg: DriveCfg) -> int:
@@ -183,9 +177,7 @@ def run(cfg: DriveCfg) -> int:
             before.
     """
     cfg.validate()
-    folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
-    if cfg.log is not None:
-        folder = cfg.log.with_suffix("") if cfg.log.suffix == MCAP else cfg.log
+    folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     check_folder(folder)
     if is_log(folder):
         raise FileExistsError(f"{folder} holds a log; choose another folder")
@@ -308,7 +300,7 @@ def _pursue(
         log = _log(cfg, folder, connection, description)
         served = None if connection.ros is None else RosGoals(connection.ros, goals)
         if served is not None:
-            log.also_to(served)
+            log.also_to(served.event)
         pacer = Pacer(hz, latest=LATEST)
         reason = "aborted"
         outcomes = list[str]()
@@ -385,12 +377,7 @@ def _log(
     servo = connection.joints.servo()
     without = () if connection.ros is None else UNKNOWN
     truth = connection.twin is not None
-    log = LogWriter(folder, hand, description, servo=servo, truth=truth, without=without)
-    if cfg.log is not None and cfg.log.suffix == MCAP:
-        from vd.logs.mcap_log import McapLog
-
-        log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
-    return log
+    return LogWriter(folder, hand, description, servo=servo, truth=truth, without=without)
 
 
 def _poses(

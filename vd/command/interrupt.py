@@ -41,7 +41,6 @@ EXTRAS = {
     "hardware": ("dynamixel_sdk", "serial", "pyrealsense2", "cv2"),
     "recordings": ("pyarrow", "rosbags"),
     "gym": ("gymnasium",),
-    "log": ("mcap_ros2", "rosbags"),
     "export": ("onnx", "onnxscript", "onnxruntime"),
 }
 """Packages that not every user needs, by the extra that brings them."""

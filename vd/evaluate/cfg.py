@@ -133,8 +133,6 @@ class EvalCfg(HandFlags, EpisodeFlags):
     on the D'Claw policies if none is named. --objects training=FOLDER held-out=FOLDER names
     objects; without, our procedural sets stand for them.
     """
-    quick: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
     jobs: int = 1
     """Of a suite, evaluations side by side, each in a process of its own, spread over the GPUs."""
     shard: str | None = None
@@ -237,9 +235,9 @@ class EvalCfg(HandFlags, EpisodeFlags):
             if len(both := [flag(name) for name in names if name in given]) > 1:
                 raise ValueError(f"{' and '.join(both)} exclude each other; give one of them")
         shard((), self.shard)
-        if self.suite is None and (self.quick or self.jobs > 1 or self.shard):
+        if self.suite is None and (self.jobs > 1 or self.shard):
             raise ValueError(
-                "--quick, --jobs and --shard are of a suite; add --suite paper, or leave them out"
+                "--jobs and --shard are of a suite; add --suite paper, or leave them out"
             )
         decided = [flag(name) for name in OF_THE_SUITE if self.suite and name in given]
         if decided:

@@ -3,17 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from vd.command.page import write_html
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, HOLD_S
 from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Header and rows."""
@@ -44,13 +39,6 @@ _BOUND_HEADER = (
     "said and right",
     "mean error [rad]",
 )
-GREY = "#8a8f98"
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of policies in their order: those of Okabe and Ito, which colour-blind readers can tell apart."""
-PANELS = 3
-"""Panels of the figure side by side."""
-PANEL_INCH = (4.2, 3.6)
-"""Width and height of a panel."""
 
 
 def shown_name(text: str) -> str:
@@ -142,7 +130,6 @@ def write_page(
         differences=_differences(result),
         figures=figures,
         missing=missing,
-        errors=ecdf_figure(result) if result.rows else None,
         bounds=_bound_table(headlines),
         warnings=result.warnings,
         objects=[] if conditions else objects,
@@ -186,43 +173,6 @@ def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
             cells.append(cell.ljust(width) if column < words else cell.rjust(width))
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
-
-
-def ecdf_figure(result: Result) -> "Figure":
-    """Distributions of the errors at the stop or end of each policy's headline row.
-
-    A panel for each condition and group.
-    """
-    from matplotlib.figure import Figure
-
-    headlines = result.headlines()
-    columns = min(PANELS, len(headlines))
-    rows = -(-len(headlines) // columns)
-    width, height = PANEL_INCH
-    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
-    angle = np.linspace(0.0, np.pi, 200)
-    by_chance = (angle - np.sin(angle)) / np.pi  # of orientations uniform on SO(3)
-    colour = dict(zip(result.policies, COLOURS * len(result.policies), strict=False))
-    for panel, ((condition, group), row_of) in enumerate(headlines.items()):
-        axes = figure.add_subplot(rows, columns, panel + 1)
-        axes.spines[["top", "right"]].set_visible(False)
-        for policy, row in row_of.items():
-            # Lost objects count, but have no error: the curve ends below one.
-            errors = np.sort([e.exact_error_rad for e in row.episodes if not e.fell])
-            shares = np.arange(len(errors) + 1) / len(row.episodes)
-            axes.step(
-                np.concatenate([[0.0], errors, [np.pi]]),
-                np.append(shares, shares[-1]),
-                where="post",
-                color=colour[policy],
-                label=policy,
-            )
-            axes.axvline(row.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
-        axes.plot(angle, by_chance, color=GREY, linestyle=":", label="at random")
-        axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0), title=condition or group)
-        axes.set(xlabel="error at the stop or end [rad]", ylabel="share of episodes")
-        axes.legend(frameon=False, loc="lower right", fontsize=7)
-    return figure
 
 
 def _success_table(rows: Sequence[Row]) -> Table:

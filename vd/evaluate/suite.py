@@ -18,13 +18,6 @@ Choices are made on training and validation, held-out judges. For validation not
 is left out.
 """
 
-QUICK_OBJECTS = 6
-"""Objects of a group in the reduced suite."""
-QUICK_EPISODES = 4
-"""Episodes of each in the reduced suite."""
-QUICK_CAMERA_EPISODES = 1
-"""The same of a camera policy, of which a control step takes a second and more on a CPU."""
-
 
 @dataclass(frozen=True)
 class SuiteEntry:
@@ -39,8 +32,6 @@ class SuiteEntry:
     """The same for policies that see by a camera."""
     shown: str = ""
     """Where the paper shows the same, or what is changed."""
-    quick: bool = False
-    """Part of the reduced suite."""
 
     @property
     def lines(self) -> list[str]:

@@ -43,9 +43,6 @@ from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
     OWN_SETS,
-    QUICK_CAMERA_EPISODES,
-    QUICK_EPISODES,
-    QUICK_OBJECTS,
     Claim,
     Suite,
     SuiteEntry,
@@ -123,11 +120,8 @@ def run_suite(cfg: EvalCfg) -> Result:
     assert cfg.suite is not None
     suite = read_suite(cfg.suite)
     wanted = groups_of(suite.lines)
-    groups = object_groups(cfg.objects, wanted, quick=cfg.quick, members=suite.members)
-    lines = suite.lines
-    if cfg.quick:
-        lines = tuple(entry for entry in lines if entry.quick)
-    entries = [entry for entry in lines if groups.keys() >= set(groups_of([entry]))]
+    groups = object_groups(cfg.objects, wanted, members=suite.members)
+    entries = [entry for entry in suite.lines if groups.keys() >= set(groups_of([entry]))]
     tasks = shard(make_tasks(cfg, entries, groups), cfg.shard)
     results: dict[tuple[str, str], Result] = {}
     missing: dict[tuple[str, str], str] = {}
@@ -288,9 +282,6 @@ def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, ObjectGroup
         value = getattr(cfg, name)
         if value != getattr(EvalCfg, name):
             changes[name] = value
-    if cfg.quick:
-        most = QUICK_CAMERA_EPISODES if _by_camera(policy) else QUICK_EPISODES
-        changes["episodes"] = min(asked.episodes, most)
     asked = replace(asked, policies=(policy,), objects=tuple(objects), **changes)
     asked.validate()
     return asked
@@ -305,7 +296,6 @@ def object_groups(
     objects: Sequence[str],
     wanted: Sequence[str],
     *,
-    quick: bool,
     members: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, ObjectGroup]:
     """The objects of each wanted group.
@@ -335,10 +325,6 @@ def object_groups(
             files = _members(group, files, names)
             sets = tuple(map(str, files))
         text = f"{len(files)} of {shown_name(', '.join(given.get(group, sets)))}"
-        if quick and len(files) > QUICK_OBJECTS:
-            step = len(files) / QUICK_OBJECTS
-            sets = tuple(str(files[int(i * step)]) for i in range(QUICK_OBJECTS))
-            text = f"{len(sets)} of the {text}"
         if group not in given and group != "symmetric":
             text += ", our own, since no others were given: they stand for the paper's meshes"
         groups[group] = ObjectGroup(sets, text)
@@ -376,7 +362,7 @@ def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectG
         figures = aspect_table(short, groups)
     else:
         figures = robust_table(short, suite.lines)
-    summary = result.summary() | {"quick": cfg.quick, "figures": figures}
+    summary = result.summary() | {"figures": figures}
     write_json(cfg.out / f"{cfg.suite_name}.json", summary)
     notes = [f"Objects, {name}: {group.text}." for name, group in groups.items()]
     notes.append("Held-out objects judge, and nothing is chosen on them.")
@@ -385,8 +371,6 @@ def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectG
     lead = ", ".join(short.policies)
     if of_paper:
         lead += " beside the paper"
-    if cfg.quick:
-        lead += ", the reduced suite"
     table = None
     if figures:
         table = (list(figures[0]), [list(figure.values()) for figure in figures])

@@ -17,7 +17,7 @@ from vd.gap.result import (
     Credit,
     Estimate,
     FamilyVerdict,
-    Fit,
+    FittedModel,
     HeldOut,
     JointGap,
     Misfit,
@@ -180,13 +180,13 @@ def _errors(joint: AnalysedJoint, recording: Recording) -> list[TrajectoryError]
     return rows
 
 
-def _fit(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> Fit:
+def _fit(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> FittedModel:
     """Errors of a model of each joint on what it was fitted to, and its baseline's parameters."""
     count = sum(fit.count.sum() for fit in fits)
     parameters = {}
     for joint, fit in zip(joints, fits, strict=True):
         parameters[joint.name] = _baseline_values(joint.spec, fit)
-    return Fit(
+    return FittedModel(
         rmse_rad=float(np.sqrt(sum(fit.sse.sum() for fit in fits) / count)),
         per_joint={joint.name: fit.rmse for joint, fit in zip(joints, fits, strict=True)},
         mae_rad=float(sum(fit.absolute.sum() for fit in fits) / count),

@@ -61,17 +61,21 @@ def write_identified(
     (folder / WHOLE_HAND_LAYER).unlink(missing_ok=True)
     others = {} if hand is None else counterparts(hand, tuple(fitted))
     source = {joint: joint for joint in fitted}
-    for name, known in ((LAYER, source), (WHOLE_HAND_LAYER, source | others))[: 2 if others else 1]:
+    layers = {LAYER: source}
+    if others:
+        layers[WHOLE_HAND_LAYER] = source | others
+    for name, known in layers.items():
+        baseline = {}
+        effects = {}
+        for joint, own in known.items():
+            values = fitted[own]
+            baseline[joint] = {p.name: values[p.name] for p in BASELINE if p.name in values}
+            effects[joint] = _effects(held, own, values, start)
         write_layer(
             folder / name,
             hand if hand is not None else recording.model,
-            baseline={
-                joint: {p.name: fitted[own][p.name] for p in BASELINE if p.name in fitted[own]}
-                for joint, own in known.items()
-            },
-            effects={
-                joint: _effects(held, own, fitted[own], start) for joint, own in known.items()
-            },
+            baseline=baseline,
+            effects=effects,
             tool="vd-gap",
             recording=report.recording.path,
         )
@@ -88,7 +92,11 @@ def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
         kind = None if motor is None else replace(motor, id=0, sign=1.0, offset_rad=0.0)
         like[joint] = joint.partition("_")[2], np.count_nonzero(hand.joint_finger == finger), kind
     place = {like[joint]: joint for joint in reversed(known)}
-    return {j: place[like[j]] for j in hand.joint_names if j not in known and like[j] in place}
+    others = {}
+    for joint in hand.joint_names:
+        if joint not in known and like[joint] in place:
+            others[joint] = place[like[joint]]
+    return others
 
 
 def _effects(

@@ -64,16 +64,13 @@ class Contact:
         make_folder(self.out)
         write_contact_layer(layer, file, identified(found), str(self.recording))
         write_json(self.out / REPORT, report)
-        print(
-            f"{report['verdict']}: "
-            f"{', '.join(e['name'] for e in report['effects']) or 'nothing named'}"
-        )
+        names = [effect["name"] for effect in report["effects"]]
+        print(f"{report['verdict']}: {', '.join(names) or 'nothing named'}")
         for each in found:
-            value = " ".join(
-                f"{v:.4g} ({a:.4g} to {b:.4g})"
-                for v, a, b in zip(each.value, each.low, each.high, strict=True)
-            )
-            print(f"  {each.name}: {each.verdict}: {value}; {each.reason}")
+            values = []
+            for value, low, high in zip(each.value, each.low, each.high, strict=True):
+                values.append(f"{value:.4g} ({low:.4g} to {high:.4g})")
+            print(f"  {each.name}: {each.verdict}: {' '.join(values)}; {each.reason}")
         print(f"{self.out / REPORT}\n{layer}")
         return 0
 

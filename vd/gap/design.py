@@ -24,7 +24,6 @@ SO-101's elbow the widest piece alone (1 in its place) names asymmetric friction
 Coulomb friction.
 """
 
-
 ENOUGH = 10
 """Motions of a joint from which one is kept from every fit, to judge what is delivered. Not tuned."""
 
@@ -43,14 +42,14 @@ def design(
     """
     name = chain.joints[joint]
     column = int(chain.columns[joint])
-    own = [
-        i
-        for i, t in enumerate(recording.trajectories)
-        if name in t.joints and float(np.ptp(t.command[:, column])) > 0.0
-    ]
-    if not own:
+    moving = []
+    for i, trajectory in enumerate(recording.trajectories):
+        if name in trajectory.joints and np.ptp(trajectory.command[:, column]) > 0.0:
+            moving.append(i)
+    if not moving:
         return (), (), None
-    own = [own[i] for i in np.unique(np.linspace(0, len(own) - 1, MAX_MOTIONS).round().astype(int))]
+    spread = np.linspace(0, len(moving) - 1, MAX_MOTIONS).round().astype(int)
+    own = [moving[i] for i in np.unique(spread)]
     aside = None
     if len(own) >= ENOUGH:
         sizes = [np.ptp(recording.trajectories[i].command[:, column]) for i in own]

@@ -12,7 +12,11 @@ from vd.gap.result import Predictions, Report
 from vd.gap.words import LISTED
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
-INK, BLUE, ORANGE, GREEN, GREY = "#1c2330", "#0072B2", "#D55E00", "#009E73", "#8a8f98"
+INK = "#1c2330"
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+GREY = "#8a8f98"
 WINDOW_S = 6.0
 """Longest piece of a trajectory that is drawn: what the eye follows at a page's width. Not
 tuned.
@@ -26,17 +30,11 @@ def gap_figure(report: Report) -> Figure:
     figure = Figure(figsize=(9.0, 1.2 + 0.5 * max(len(joints), 2)), layout="constrained")
     axes = figure.add_subplot()
     places = -np.arange(len(joints))
+    before = [(joint.baseline_rmse_rad, *joint.baseline_ci95) for joint in joints]
+    after = [(joint.identified_rmse_rad, *joint.identified_ci95) for joint in joints]
     models = (
-        (
-            "before: the plain servo model",
-            ORANGE,
-            [(j.baseline_rmse_rad, *j.baseline_ci95) for j in joints],
-        ),
-        (
-            "after: the identified model",
-            GREEN,
-            [(j.identified_rmse_rad, *j.identified_ci95) for j in joints],
-        ),
+        ("before: the plain servo model", ORANGE, before),
+        ("after: the identified model", GREEN, after),
     )
     for side, (label, color, numbers) in zip((0.2, -0.2), models, strict=True):
         values, lows, highs = 1e3 * np.array(numbers).T

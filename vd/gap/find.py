@@ -76,7 +76,11 @@ def findings(
     found = []
     for column, name in enumerate(recording.joints):
         if name in floors:
-            own = [(t, t.position[:, column] - p[:, column]) for t, p in parts if name in t.joints]
+            own = []
+            for trajectory, simulated in parts:
+                if name in trajectory.joints:
+                    left = trajectory.position[:, column] - simulated[:, column]
+                    own.append((trajectory, left))
             found += _joint(name, own, column, recording.encoder_resolution_rad, floors[name])
     return found
 

@@ -80,7 +80,7 @@ class Misfit:
 
 
 @dataclass(frozen=True)
-class Fit:
+class FittedModel:
     """A model and its error on all trajectories."""
 
     rmse_rad: float
@@ -242,13 +242,13 @@ class Report:
 
     verdict: Verdict
     noise_floor_rad: float
-    baseline: Fit
+    baseline: FittedModel
     findings: tuple[Misfit, ...]
     effects: tuple[NamedEffect, ...]
     ambiguous: tuple[tuple[str, ...], ...]
     """Sets of effects that the recording cannot tell apart; ``models`` has the models that they are
     from, whose members are not free to combine."""
-    identified: Fit
+    identified: FittedModel
     """The best of the good models: the named effects and the provisional ones."""
     held_out: HeldOut
     next_experiment: str

@@ -1,7 +1,6 @@
-"""Names in the log of a run on a hand (:mod:`vd.logs.hand_log`), whichever file it is in."""
+"""Names in the log of a run on a hand (:mod:`vd.logs.hand_log`)."""
 
 LOG_FORMAT = "vd-hand-log/1"
-MCAP = ".mcap"
 RUN_FILE = "run.json"
 STEPS_FILE = "steps.csv"
 EVENTS_FILE = "events.jsonl"

@@ -5,7 +5,6 @@
 
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +20,7 @@ from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.logs.hand_log import is_log
 from vd.paper import PAPER
-from vd.policy.agents import DEFAULT_HAND, check_names, default_policy, installed_policies
+from vd.policy.agents import DEFAULT_HAND, check_names, default_policy
 from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:
@@ -129,17 +128,9 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
 
 def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C."""
-    from vd.play.replay import Replay
     from vd.play.viewer import PlayViewer
 
-    chosen: dict[str, Any] = {}
-    if not isinstance(session, Replay):
-        names = tuple(dict.fromkeys((cfg.policy, *_policies())))
-        chosen = {
-            "policies": names,
-            "reopen": lambda name: _session(replace(cfg, policy=name, hand=None, hand_layer=None)),
-        }
-    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False, **chosen)
+    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False)
     print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
     try:
         viewer.run()
@@ -155,19 +146,6 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
         count[index] = count.get(index, 0) + 1
         rank.append(count[index])
     return sorted(sorted(range(len(rank)), key=rank.__getitem__)[:cells])
-
-
-def _policies() -> list[str]:
-    """Names of the policies that are installed, of hands that are."""
-    from vd.assets_usd.hands import check_hand_name
-    from vd.policy.contract import installed_contract
-
-    names = []
-    for name, path in installed_policies().items():
-        with suppress(ValueError, OSError):  # it is damaged, or of a hand to be imported
-            check_hand_name(installed_contract(path).task["hand"])
-            names.append(name)
-    return names
 
 
 def _session(cfg: PlayCfg) -> "Session":

@@ -29,7 +29,6 @@ class Replay:
     def __init__(self, log: HandLog):
         self.log = log
         self._now = 0
-        self.sees = False
         if not len(log.goals):
             raise LogError(f"{log.path} has no goal to show")
         self.control_hz = float(log.run["control_hz"])

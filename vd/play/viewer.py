@@ -1,4 +1,4 @@
-"""The web viewer: Newton's viser viewer with goal ghost, menus, and a camera's view.
+"""The web viewer: Newton's viser viewer with goal ghost, buttons, and a camera's view.
 
 Browser events arrive on viser's threads; they are queued and handled between steps on the thread
 that runs the simulation. Everything is served from this machine, so it works without a network.
@@ -7,7 +7,7 @@ that runs the simulation. Everything is served from this machine, so it works wi
 import math
 import queue
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from html import escape
 from typing import Any
@@ -41,10 +41,7 @@ class PlayViewer:
     It serves on ``host``, of which ``127.0.0.1`` keeps it on this machine, and the next free port.
 
     Args:
-        session: What is shown first.
-        policies: Names of policies to choose from, that of the session first.
-        reopen: Gives a session of another of them; it may raise ValueError, OSError or
-            RuntimeError.
+        session: What is shown.
         host: Address.
         port: Port.
         verbose: Whether Newton's viewer says that it begins.
@@ -54,21 +51,22 @@ class PlayViewer:
         self,
         session: Session | Replay,
         *,
-        policies: Sequence[str] = (),
-        reopen: Callable[[str], Session] | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
         verbose: bool = True,
     ):
-        self._policies = policies
-        self._reopen = reopen
-        self._eye: tuple[Any, Any] | None = None
         self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
         options = self.viewer._viewer_option_handles
         for name in options.keys() - set(SHOWN_OPTIONS):
             options.pop(name).remove()
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        self._show(session)
+        self.session = session
+        self.camera = PictureCamera.for_hand(session.hand)
+        self._models: dict[str, PictureModel] = {}
+        x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
+        self._ghost = float(x), float(y), GHOST_HEIGHT
+        self._show_object()
+        self._set_camera()
         self._build_panel()
         self.viewer.set_reset_callback(lambda: self.session.reset())
         self.draw()
@@ -108,22 +106,14 @@ class PlayViewer:
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
         self._status.content = status_html(shot)
-        self._show_view()
+        if isinstance(self.session, Session) and self.session.sees:
+            self._eye.image = self.session.view()
         self.viewer.end_frame()
 
     def close(self) -> None:
         """Stop serving, and close the session."""
         self.viewer.close()
         self.session.close()
-
-    def _show(self, session: Session | Replay) -> None:
-        self.session = session
-        self.camera = PictureCamera.for_hand(session.hand)
-        self._models: dict[str, PictureModel] = {}
-        x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
-        self._ghost = float(x), float(y), GHOST_HEIGHT
-        self._show_object()
-        self._set_camera()
 
     def _show_object(self) -> None:
         """Show the model of the chosen object.
@@ -136,21 +126,6 @@ class PlayViewer:
             self._models[name] = PictureModel(self.session.hand, [item], ghost_in_scene=True)
         self._pictured = self._models[name]
         self.viewer.set_model(self._pictured.model)
-
-    def _show_view(self) -> None:
-        """What the policy's camera sees, in a folder that others do not have."""
-        if isinstance(self.session, Session) and self.session.sees:
-            image = self.session.view()
-            if self._eye is None:
-                folder = self.viewer.server.gui.add_folder(
-                    "Camera, believed pose drawn in", order=-0.5
-                )
-                with folder:
-                    self._eye = folder, self.viewer.server.gui.add_image(image, format="jpeg")
-            self._eye[1].image = image
-        elif self._eye is not None:
-            self._eye[0].remove()
-            self._eye = None
 
     def _set_camera(self) -> None:
         eye = np.asarray(self.camera.eye)
@@ -167,57 +142,30 @@ class PlayViewer:
         session = self.session
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
-            if len(self._policies) > 1:
-                self._acting = self._policies[0]
-                self._policy_menu = self._menu(
-                    "Policy", self._policies, self._acting, self._choose_policy
-                )
             if len(session.object_names) > 1:
-                self._menu("Object", session.object_names, session.object_name, self._choose_object)
+                self._build_menu(session)
             new_goal = gui.add_button("New goal")
+        if isinstance(session, Session) and session.sees:
+            with gui.add_folder("Camera, believed pose drawn in", order=-0.5):
+                self._eye = gui.add_image(session.view(), format="jpeg")
 
         @new_goal.on_click
         def _(_event: Any) -> None:
             self._events.put(lambda: self.session.new_goal())
 
-    def _menu(
-        self, label: str, names: Sequence[str], now: str, choose: Callable[[str], None]
-    ) -> Any:
-        menu = self.viewer.server.gui.add_dropdown(label, tuple(names), initial_value=now)
+    def _build_menu(self, session: Session | Replay) -> None:
+        menu = self.viewer.server.gui.add_dropdown(
+            "Object", tuple(session.object_names), initial_value=session.object_name
+        )
 
         @menu.on_update
         def _(event: Any) -> None:
             if event.client_id is not None:
-                self._events.put(partial(choose, menu.value))
-
-        return menu
+                self._events.put(partial(self._choose_object, menu.value))
 
     def _choose_object(self, name: str) -> None:
         self.session.choose_object(name)
         self._show_object()
-
-    def _choose_policy(self, name: str) -> None:
-        assert self._reopen is not None
-        watched = self.session.object_name
-        notes = self._tell(f"{name} begins", "building the scene", loading=True)
-        try:
-            session = self._reopen(name)
-        except (ValueError, OSError, RuntimeError) as error:
-            self._tell(f"{name} cannot be shown", str(error))
-            self._policy_menu.value = self._acting
-            return
-        finally:
-            for note in notes:
-                note.remove()
-        self.session.close()
-        self._acting = name
-        session.choose_object(watched)
-        self._show(session)
-
-    def _tell(self, title: str, body: str, *, loading: bool = False) -> list[Any]:
-        """Tell everybody who looks."""
-        clients = self.viewer.server.get_clients().values()
-        return [client.add_notification(title, body, loading=loading) for client in clients]
 
 
 def status_html(shot: Snapshot) -> str:

@@ -97,26 +97,31 @@ class CameraObserver:
         device: str,
         library: Any,
     ):
-        self._hand, self._rate, self._device = hand, control_hz, device
-        xp, place, links = library, wp.device_to_torch(device), np.arange(len(hand.link_names))
+        self._hand = hand
+        self._rate = control_hz
+        self._device = device
+        place = wp.device_to_torch(device)
+        links = np.arange(len(hand.link_names))
 
         def array(values: Any, dtype: Any) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         def own(values: Any) -> Array:
-            return xp.asarray(values, dtype=xp.float32, device=place, copy=True)
+            return library.asarray(values, dtype=library.float32, device=place, copy=True)
 
-        envs: dict[str, Any] = {
-            "world_object": world_object,
-            "world_scale": world_scale,
-            "device": device,
-        }
         self._hand_cloud = HandCloud(hand, link_body=links, device=device)
         self._ages = (0.0,) if alignment is None else AGES_S
         self.finder: Registration | GoalFinder
         symmetry = np.tile([0.0, 0.0, 0.0, 1.0], (len(world_object), 1, 1))
         if alignment is None:
-            self.finder = Registration(objects, camera=camera, library=xp, **envs)
+            self.finder = Registration(
+                objects,
+                world_object=world_object,
+                world_scale=world_scale,
+                camera=camera,
+                device=device,
+                library=library,
+            )
             symmetry = symmetries_of_worlds(objects, world_object, device)
         else:
             from vd.vision import finder
@@ -124,20 +129,17 @@ class CameraObserver:
             self.finder = finder.GoalFinder(
                 alignment, objects, world_object=world_object, world_scale=world_scale
             )
-        self._symmetry, self._before = own(symmetry), own(self.finder.pose[:, 0])
+        self._symmetry = own(symmetry)
+        self._before = own(self.finder.pose[:, 0])
         self._fingertips = Fingertips(hand, own)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
         self._past_links = wp.empty_like(self._links)
-        self._base, self._lower, self._upper = (
-            own(hand.mount[None]),
-            own(hand.lower),
-            own(hand.upper),
-        )
+        self._base = own(hand.mount[None])
+        self._lower = own(hand.lower)
+        self._upper = own(hand.upper)
         self._columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)
-        self._size, state = (
-            num_observations,
-            teacher_observation_size(hand.num_fingers, hand.num_joints),
-        )
+        self._size = num_observations
+        state = teacher_observation_size(hand.num_fingers, hand.num_joints)
         self._columns["shape"] = slice(state, num_observations)
         self._shapes = ShapeObserver(
             array(np.stack([item.surface_points for item in objects]), wp.vec3),
@@ -200,13 +202,16 @@ class CameraObserver:
 
     def _find(self, senses: Senses) -> Found:
         """Find the objects among the camera's points, or follow them; links are posed."""
-        followed, before, xp = self.finder, self._before, library_of(senses.points)
+        followed = self.finder
+        before = self._before
+        xp = library_of(senses.points)
         cloud = [*(self._hand_points(age, senses) for age in self._ages), senses.points]
         hand = len(self._ages) * self._hand_cloud.count
         seen, count = object_points(
             xp.concatenate(cloud, axis=1), hand, PAPER.cloud.voxel_m, followed.most
         )
-        pose, base, turn = followed.pose[:, 0], self._base[:, :3], self._base[:, 3:]
+        pose = followed.pose[:, 0]
+        turn = self._base[:, 3:]
         if isinstance(followed, Registration):
             followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         else:
@@ -217,7 +222,7 @@ class CameraObserver:
         step = relative_rotation(pose[:, 3:], before[:, 3:])
         found = Found(
             orientation=product(turn, pose[:, 3:]),
-            position=base + rotated(turn, pose[:, :3]),
+            position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
             spin=moves
             * 2.0

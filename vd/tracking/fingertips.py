@@ -29,7 +29,8 @@ class Fingertips:
         order = np.arange(hand.num_joints).reshape(-1, hand.joints_per_finger)
         frames = np.empty((len(order), hand.joints_per_finger + 1, 7))
         for finger, joints in enumerate(order):
-            before, links = hand.mount, [0, *hand.joint_child[joints]]
+            before = hand.mount
+            links = [0, *hand.joint_child[joints]]
             if list(hand.joint_parent[joints]) != links[:-1] or hand.tip_link[finger] != links[-1]:
                 raise ValueError(
                     f"the joints of finger {finger} of {hand.name} are no chain to its tip"
@@ -40,7 +41,8 @@ class Fingertips:
             frames[finger, -1] = compose(before, hand.tip_frame[finger])
         # From each joint's frame, turned, to the next one's: of the first from the world, at the
         # end the tip.
-        self._frame, self._axis = array(frames), array(hand.joint_axis[order])
+        self._frame = array(frames)
+        self._axis = array(hand.joint_axis[order])
 
     def __call__(self, position: Array, velocity: Array) -> Array:
         """Position [m], quaternion, velocity [m/s] and angular velocity [rad/s] of each fingertip in turn.
@@ -48,15 +50,20 @@ class Fingertips:
         Joint positions [rad] and velocities [rad/s] are [N, D]; columns [N, 13 G] as of
         :func:`vd.kernels.task.observations.teacher_observation_slices`.
         """
-        xp, shape = library_of(position), (len(position), *self._axis.shape[:2], 1)
-        half, rate = 0.5 * position.reshape(shape), velocity.reshape(shape)
+        xp = library_of(position)
+        shape = (len(position), *self._axis.shape[:2], 1)
+        half = 0.5 * position.reshape(shape)
+        rate = velocity.reshape(shape)
         turn = xp.concatenate([self._axis * xp.sin(half), xp.cos(half)], axis=-1)
         pose = xp.broadcast_to(self._frame[:, 0], (len(position), *self._frame[:, 0].shape))
-        spin, moment = xp.zeros_like(pose[..., :3]), xp.zeros_like(pose[..., :3])
+        spin = xp.zeros_like(pose[..., :3])
+        moment = xp.zeros_like(pose[..., :3])
         for joint in range(self._axis.shape[1]):
-            place, orientation = pose[..., :3], product(pose[..., 3:], turn[..., joint, :])
+            place = pose[..., :3]
+            orientation = product(pose[..., 3:], turn[..., joint, :])
             axis = rate[..., joint, :] * rotated(orientation, self._axis[None, :, joint])
-            spin, moment = spin + axis, moment + xp.linalg.cross(axis, place)
+            spin = spin + axis
+            moment = moment + xp.linalg.cross(axis, place)
             following = self._frame[None, :, joint + 1]
             place = place + rotated(orientation, following[..., :3])
             pose = xp.concatenate([place, product(orientation, following[..., 3:])], axis=-1)

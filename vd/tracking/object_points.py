@@ -32,7 +32,9 @@ def object_points(points: Array, hand: int, voxel_m: float, most: int) -> tuple[
         Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, neighbours beside
         each other, and how many there are, int32 [N]. Waits for the device.
     """
-    xp, device, envs = library_of(points), points.device, len(points)
+    xp = library_of(points)
+    device = points.device
+    envs = len(points)
     keys = xp.empty(points.shape[:2], dtype=xp.int64, device=device)
     launch(voxel_key_kernel, keys.shape, [as_warp(points, wp.vec3), voxel_m], [as_warp(keys)])
     voxels, place = xp.unique(keys, return_inverse=True)
@@ -45,7 +47,8 @@ def object_points(points: Array, hand: int, voxel_m: float, most: int) -> tuple[
     launch(coordinates_kernel, len(free), [as_warp(free)], [as_warp(rows)])
     cloud = xp.asarray(rows[:, 0], dtype=xp.int64)
     first = xp.searchsorted(cloud, xp.arange(envs + 1, device=device))
-    counts, rank = xp.diff(first), xp.arange(len(cloud), device=device) - first[cloud]
+    counts = xp.diff(first)
+    rank = xp.arange(len(cloud), device=device) - first[cloud]
     # Of more than ``most`` every so many-th is taken, in the order of the rows, in which neighbours
     # follow each other: those left out would share a place with the one before them.
     share = counts.clip(min=most)[cloud]

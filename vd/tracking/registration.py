@@ -48,10 +48,14 @@ MARGIN_M = 0.002
 """Depth within which the shape may stand out [m]: half a cell, seen aslant."""
 ROTATIONS = 2048
 """Rotations tried at the first look, about 0.25 rad apart."""
-FIRST_STEPS, FIRST_EVERY = 3, 4
-"""Steps of each of these, and every so many-th point they look at."""
-CHOSEN, CHOSEN_STEPS = 64, 8
-"""How many of them are improved further, and steps of these."""
+FIRST_STEPS = 3
+"""Steps of each of these."""
+FIRST_EVERY = 4
+"""Every so many-th point is looked at in these."""
+CHOSEN = 64
+"""How many of them are improved further."""
+CHOSEN_STEPS = 8
+"""Steps of these."""
 KEPT = 6
 """Poses that are followed."""
 OTHERS = 6
@@ -76,10 +80,13 @@ SHARE = 0.1
 def even_rotations(count: int) -> np.ndarray:
     """Rotations that lie evenly, quaternions xyzw [count, 4] (super-Fibonacci spiral, Alexa 2022)."""
     # Its two constants: the root of 2, and the positive root of x^4 = x + 4.
-    first, second = np.sqrt(2.0), 1.533751168755204288118041
+    first = np.sqrt(2.0)
+    second = 1.533751168755204288118041
     along = np.arange(count) + 0.5
-    share, turn = along / count, 2.0 * np.pi * along
-    inner, outer = np.sqrt(share), np.sqrt(1.0 - share)
+    share = along / count
+    turn = 2.0 * np.pi * along
+    inner = np.sqrt(share)
+    outer = np.sqrt(1.0 - share)
     return np.stack(
         [
             inner * np.sin(turn / first),
@@ -123,8 +130,10 @@ class Registration:
             device: Warp device.
             library: Of its arrays, torch or on a CPU numpy.
         """
-        self.device, envs, xp = device, len(world_object), library
-        self._xp, place = xp, wp.device_to_torch(device)
+        self.device = device
+        envs = len(world_object)
+        self._xp = xp = library
+        place = wp.device_to_torch(device)
 
         def array(values: Any, dtype: Any) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
@@ -134,10 +143,8 @@ class Registration:
         shapes.samples = array(samples, wp.vec3)
         shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
         shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
-        shapes.world_shape, shapes.world_scale = (
-            array(world_object, wp.int32),
-            array(world_scale, float),
-        )
+        shapes.world_shape = array(world_object, wp.int32)
+        shapes.world_scale = array(world_scale, float)
         meshes = [
             wp.Mesh(
                 array(item.vertices, wp.vec3),
@@ -156,14 +163,14 @@ class Registration:
             [shapes.samples, mesh, shapes.half, meshed],
             [shapes.distance],
         )
-        self._eye, cells = Eye(), (0, 0)
+        self._eye = Eye()
+        cells = (0, 0)
         if camera is not None:
-            self._eye.focal, self._eye.centre = (
-                wp.vec2(camera.fx, camera.fy),
-                wp.vec2(camera.cx, camera.cy),
-            )
+            self._eye.focal = wp.vec2(camera.fx, camera.fy)
+            self._eye.centre = wp.vec2(camera.cx, camera.cy)
             self._eye.pose = wp.transform(*camera.position.tolist(), *camera.quaternion.tolist())
-            self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
+            self._eye.cell = CELL_PX
+            self._eye.margin = MARGIN_M
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
         self._placing = [shapes, self._eye, int(camera is not None), EVERY_SAMPLE]
         self._nearness = wp.zeros((envs, *cells), dtype=float, device=device)
@@ -200,7 +207,8 @@ class Registration:
             cloud = as_warp(points, wp.vec3)
             launch(nearness_kernel, cloud.shape, [self._eye, cloud], [self._nearness])
         self.looks[fresh] = 0
-        seen_now, known = count > 0, self.looks > 0
+        seen_now = count > 0
+        known = self.looks > 0
         self._follow(as_warp(self._xp.where(known & seen_now, self._worlds, -1)), inputs)
         first = self._xp.where(~known & seen_now)[0]  # waits for the device
         if len(first):
@@ -252,14 +260,17 @@ class Registration:
 
         A row an environment, -1 where it is left out.
         """
-        known, again, others = slice(KEPT), slice(KEPT, 2 * KEPT), slice(2 * KEPT, None)
+        known = slice(KEPT)
+        again = slice(KEPT, 2 * KEPT)
+        others = slice(2 * KEPT, None)
         self._cost.zero_()
         wp.copy(self._found[:, known], self._kept[0])
         self._fit(self._found[:, known], self._cost[:, known], envs, STEPS, 1, inputs)
         # What falls is 4 cm farther at the next look, and steps look FAR_M far: poses that do not
         # fit as they did are put where points are now, turned as they were.
         xp = self._xp
-        pose, cost = of_warp(self._found, xp), of_warp(self._cost, xp)
+        pose = of_warp(self._found, xp)
+        cost = of_warp(self._cost, xp)
         cost[:, again][cost[:, known] <= WORSE * self.misfit] = float(NEVER)
         tried = (self.looks[:, None] * STRIDE + xp.arange(OTHERS, device=cost.device)) % ROTATIONS
         for columns, turns in ((again, self.pose[..., 3:]), (others, self._rotations[tried])):

@@ -18,24 +18,27 @@ from vd.assets_usd.objects.geometry import Surface, random_surface_points
 from vd.assets_usd.objects.model import ObjectModel
 from vd.geometry.arrays import Array, library_of, library_on
 from vd.geometry.quaternions import product, rotation_distance
+from vd.kernels.launch import launch
 from vd.kernels.sensor.shape_grids import off_mesh_kernel
 from vd.tracking.registration import POINTS, Registration
 
-OFF_M, OFF_SHARE = 0.003, 0.01
-"""A turned shape looks the same if at most this share of its surface is farther than this from
-where the
-surface was [m]: a depth camera's points are off by 2 to 3 mm, and a hundredth is the edge of a lid.
-Of 159 imported training meshes 72 have a symmetry then, with half of the distance 28, with twice
-83.
+OFF_M = 0.003
+"""A turned shape looks the same where it is no farther than this from where its surface was [m]: a
+depth camera's points are off by 2 to 3 mm. Of 159 imported training meshes 72 have a symmetry then,
+with half of the distance 28, with twice 83.
 """
+OFF_SHARE = 0.01
+"""Share of the surface that may be farther: a hundredth is the edge of a lid."""
 DENSE = 2000
 """Points of the surface that this is measured on: the share is then known to 0.4 % (two standard
 errors).
 """
 STICKS_OUT = 0.05
 """Nothing thin that is off by more than this share of the shape's length may be left over."""
-STEPS, EVERY = 12, 2
-"""Steps of each rotation that is tried, and every so many-th sample they look at."""
+STEPS = 12
+"""Steps of each rotation that is tried."""
+EVERY = 2
+"""Every so many-th sample is looked at in these."""
 APART_RAD = 0.12
 """Least angle between two symmetries: a solid of revolution has some fifty."""
 BESIDE_RAD = 0.4
@@ -114,10 +117,8 @@ def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
         library=library,
     )
     # Samples are in an order in which any leading part of them is evenly spread.
-    place, samples = (
-        wp.device_to_torch(device),
-        np.stack([item.surface_points[:POINTS] for item in items]),
-    )
+    place = wp.device_to_torch(device)
+    samples = np.stack([item.surface_points[:POINTS] for item in items])
     seen = library.asarray(samples, dtype=library.float32, device=place)
     count = library.full((len(items),), seen.shape[1], dtype=library.int32, device=place)
     poses, misfits = itself.tried(seen, count, steps=STEPS, every=EVERY)
@@ -137,7 +138,8 @@ class _Surface:
     """The surface of a shape, and how much of it a turn takes off itself."""
 
     def __init__(self, item: ObjectModel, device: str):
-        self._device, rng = device, np.random.default_rng(0)
+        self._device = device
+        rng = np.random.default_rng(0)
         self._mesh = wp.Mesh(
             wp.array(item.vertices, dtype=wp.vec3, device=device),
             wp.array(item.faces.ravel(), dtype=wp.int32, device=device),
@@ -157,9 +159,7 @@ class _Surface:
         points = wp.array(turned, dtype=wp.vec3, device=self._device)
         mesh = wp.full(len(turns), self._mesh.id, dtype=wp.uint64, device=self._device)
         off = wp.empty(points.shape, dtype=float, device=self._device)
-        wp.launch(
-            off_mesh_kernel, off.shape, inputs=[points, mesh], outputs=[off], device=self._device
-        )
+        launch(off_mesh_kernel, off.shape, [points, mesh], [off])
         found = off.numpy()
         share = (found[:, :DENSE] > OFF_M).mean(axis=1)
         return np.where(found.max(axis=1) > self._most_m, 1.0, share)

@@ -16,11 +16,13 @@ from vd.vision.rotations import quaternions
 
 LEAST = 16
 """Of fewer points nothing is told: those that it learned from had twice as many."""
-CROWD, CROWD_M = 4, 0.0102
-"""So many others within this [m] has a point of a surface, two voxels: also one in a line of
-voxels. Others are a quarter of what a camera with errors sees; 3 % are left, and 7 % of the
+CROWD = 4
+"""So many others has a point of a surface beside it, also one in a line of voxels. Points with
+fewer are a quarter of what a camera with errors sees; 3 % of them are left, and 7 % of the
 surface's go with them.
 """
+CROWD_M = 0.0102
+"""How near they are [m]: two voxels."""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """Multiples of the golden ratio, but for whole numbers, are spread evenly whatever their count."""
 

@@ -67,16 +67,17 @@ def battery(
         each = itertools.product(numbers, sizes, among)
         return [Case(kind, model, (name,), size, seed, battery=which) for seed, size, name in each]
 
+    nothing = []
+    for number in range(NOTHING_A_SEED * seeds):
+        change = changes[number % len(changes)]
+        nothing.append(Case("none", model, (), 0, first_seed + number, change, which))
+    pairs = []
+    for seed, pair in enumerate(itertools.combinations(names, 2), first_seed):
+        pairs.append(Case("pair", model, pair, PAIR_SIZE, seed, battery=which))
     cases = {
         "single": sized("single", names),
-        "none": [
-            Case("none", model, (), 0, first_seed + i, changes[i % len(changes)], which)
-            for i in range(NOTHING_A_SEED * seeds)
-        ],
-        "pair": [
-            Case("pair", model, pair, PAIR_SIZE, first_seed + number, battery=which)
-            for number, pair in enumerate(itertools.combinations(names, 2))
-        ],
+        "none": nothing,
+        "pair": pairs,
         "outside": sized("outside", (*OUTSIDE, *NOT_NAMED)),
     }
     return list(itertools.chain.from_iterable(cases[kind] for kind in kinds))

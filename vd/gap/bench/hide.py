@@ -4,6 +4,7 @@ The recording comes from :mod:`vd.gap.bench.hidden_plant`: random base parameter
 counts and jittered stamps. What is hidden is written beside the folder, never into it.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -192,7 +193,7 @@ def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
         ValueError: As of :func:`hide`.
     """
     sessions = [_Session(hiding) for hiding in hidings]
-    runs = [run for session in sessions for run in session.runs]
+    runs = list(itertools.chain.from_iterable(session.runs for session in sessions))
     # Long trajectories with long ones: a batch runs as long as its longest, with one time step.
     order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
     moved: dict[int, PlantMotion] = {}
@@ -306,7 +307,9 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Hidde
     effects = {}
     for name, given in hiding.effects.items():
         typical = effect_parameters(name)
-        signed = {p.name for p in (EFFECTS[name].parameters if name in EFFECTS else ()) if p.signed}
+        signed = []
+        if name in EFFECTS:
+            signed = [p.name for p in EFFECTS[name].parameters if p.signed]
         for key, value in given.items():
             if key not in typical:
                 raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")
@@ -332,7 +335,9 @@ def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenP
     reach = JointRange(
         joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN
     )
-    base = {name: nominal[name] * factor for name, factor in zip(BASE, [*near, *far], strict=True)}
+    base = {}
+    for name, factor in zip(BASE, [*near, *far], strict=True):
+        base[name] = nominal[name] * factor
     return reach, HiddenPlant(joints=joints, **base, full_gain=FULL_P_GAIN)
 
 

@@ -256,9 +256,11 @@ class Figure:
         for sign, bound in ((">=", self.least), ("<=", self.most)):
             if math.isfinite(bound):
                 goals.append(f"{sign} {bound:.3g}")
-        value, reached = "-", ""
+        value = "-"
+        reached = ""
         if self.values:
-            value, reached = f"{self.value:.3f}", "yes" if self.reached else "no"
+            value = f"{self.value:.3f}"
+            reached = "yes" if self.reached else "no"
         return f"| {self.what} | {', '.join(goals)} | {value} | {len(self.values)} | {reached} |"
 
 
