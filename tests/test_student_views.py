@@ -18,7 +18,6 @@ from vd.train.student.views import (
     draw_pairs,
     goal_points,
     posture_points,
-    random_joints,
     visible,
 )
 from vd.vision.rotations import turn_angle
@@ -50,7 +49,7 @@ def plates(hands, gap_m):
     [1, 800, 6].
     """
     middle = hands.box.mean(dim=0)
-    towards = torch.nn.functional.normalize(hands.eye - middle, dim=0)
+    towards = torch.nn.functional.normalize(hands.eye[0] - middle, dim=0)
     side = torch.nn.functional.normalize(torch.linalg.cross(towards, torch.eye(3)[2]), dim=0)
     grid = torch.stack(
         torch.meshgrid(*2 * [torch.linspace(-0.03, 0.03, 20)], indexing="ij"), -1
@@ -81,18 +80,18 @@ def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand):
     """Against a search through all of the hand's points, angle by angle."""
     torch.manual_seed(3)
     one = Hands(hand, 1, device="cpu")
-    torch.manual_seed(3)
-    own = posture_points(hand, random_joints(hand, 1, "cpu"))[0].double().numpy()
+    own = posture_points(hand, one.joints)[0].double().numpy()
     points = one.box[0] - 0.05 + (one.box[1] - one.box[0] + 0.1) * torch.rand(1, 1500, 3)
-    cell, depth = one.project(points)
-    free = one.free(torch.zeros(1, dtype=torch.long), points, cell, depth)[0].numpy()
+    row = torch.zeros(1, dtype=torch.long)
+    cell, depth = one.project(row, points)
+    free = one.free(row, points, cell, depth)[0].numpy()
     camera = hand.camera
     optical = Rotation.from_quat(camera.quaternion).inv()
     at, there = (optical.apply(x - camera.position) for x in (points[0].double().numpy(), own))
     across = np.linalg.norm(
         (at[:, None, :2] / at[:, None, 2:] - there[None, :, :2] / there[None, :, 2:]), axis=-1
     )
-    width = CELL_M / float(((one.box.mean(dim=0) - one.eye) @ one._optical)[2])
+    width = float(one._cell[0])
     before = there[None, :, 2] < at[:, None, 2]
     hidden = (before & (across < 0.3 * width)).any(axis=1)
     clear = ~(before & (across < 1.5 * width)).any(axis=1)
