@@ -27,8 +27,8 @@ from vd.vision.rotations import matrices_about
 from vd.vision.student import carried
 
 CELL_M = 0.007
-"""Width of a cell at the middle of where objects are: about the distance of points on a shape, so that few are seen through
-it.
+"""Width of a cell at the middle of where objects are: about the distance of points on a shape, so
+that few are seen through it.
 """
 SLACK_M = 0.012
 """How far a point may lie behind the nearest of its cell: as deep as a cell is on a steep face."""
