@@ -13,17 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-LENS = {
-    "width": 320,
-    "height": 180,
-    "fx": 256.05,
-    "fy": 256.05,
-    "cx": 160.0,
-    "cy": 90.0,
-    "near": 0.05,
-    "far": 1.5,
-}
-"""Of a camera that a hand's file does not describe: a D415's, as the D'Claw's is."""
+RANGE_M = (0.05, 1.5)
+"""Nearest and farthest depth of a camera that a hand's file does not describe [m]."""
 CAMERA_M = 0.55
 """How far it is from where objects are handled [m]: a D415 sees from 0.45 m on."""
 WANDER_SHARE = 0.4
@@ -67,6 +58,10 @@ class Intrinsics:
     def seen_from(self, camera: "CameraModel") -> "CameraModel":
         """The camera with these intrinsics, at the place and with the range of another."""
         return replace(camera, **{f.name: getattr(self, f.name) for f in fields(Intrinsics)})
+
+
+LENS = Intrinsics(width=320, height=180, fx=256.05, fy=256.05, cx=160.0, cy=90.0)
+"""Of such a camera: a D415's, as the D'Claw's is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +340,10 @@ class HandModel:
         position = self.workspace.goal_m + CAMERA_M * away
         pose = np.concatenate([position, Rotation.from_matrix(axes).as_quat()])
         in_base = compose(invert(self.mount), pose)
-        return CameraModel(**LENS, position=in_base[:3], quaternion=in_base[3:])
+        near, far = RANGE_M
+        return CameraModel(
+            **vars(LENS), near=near, far=far, position=in_base[:3], quaternion=in_base[3:]
+        )
 
     @property
     def goal_in_base(self) -> np.ndarray:

@@ -111,9 +111,7 @@ class DepthCamera:
             _extrinsics(believed, generator, cfg), dtype=wp.transform, device=device
         )
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
-        self._believed = self.extrinsics
-        if cfg.position_noise_m > 0.0 or cfg.rotation_noise_rad > 0.0:
-            self._believed = wp.array(believed, dtype=wp.transform, device=device)
+        self._believed = self._as_believed(believed)
         self.sensors = wp.array(
             [_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device
         )
@@ -144,6 +142,12 @@ class DepthCamera:
         self._history: wp.array | None = None
         if cfg.latency_s[1] > 0.0:
             self._remember_poses(math.ceil(cfg.latency_s[1] / frame_s) + 1)
+
+    def _as_believed(self, places: np.ndarray) -> wp.array:
+        """Extrinsics as calibrated [N]: places before noise [N, 7]; without noise the same array."""
+        if not (self.cfg.position_noise_m > 0.0 or self.cfg.rotation_noise_rad > 0.0):
+            return self.extrinsics
+        return wp.array(places, dtype=wp.transform, device=self.device)
 
     def _remember_poses(self, slots: int) -> None:
         """Allocate the body poses of the last ``slots`` frames, of which late images are made."""
