@@ -13,6 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+RANGE_M = (0.05, 1.5)
+"""Nearest and farthest depth of a camera that a hand's file does not describe [m]."""
+CAMERA_M = 0.55
+"""How far it is from where objects are handled [m]: a D415 sees from 0.45 m on."""
+WANDER_SHARE = 0.4
+"""How far objects are from there as a share of the way after which they are lost: with the D'Claw
+6 cm, as wide as it opens."""
+
 
 class HandError(ValueError):
     """A USD file that is not a hand, or no layer of it.
@@ -50,6 +58,10 @@ class Intrinsics:
     def seen_from(self, camera: "CameraModel") -> "CameraModel":
         """The camera with these intrinsics, at the place and with the range of another."""
         return replace(camera, **{f.name: getattr(self, f.name) for f in fields(Intrinsics)})
+
+
+LENS = Intrinsics(width=320, height=180, fx=256.05, fy=256.05, cx=160.0, cy=90.0)
+"""Of such a camera: a D415's, as the D'Claw's is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +148,13 @@ class Workspace:
     """Distance from there at which it is [m]."""
     size_m: tuple[float, float]
     """Smallest and largest longest side of an object that fits the hand [m]."""
+
+    @property
+    def box_m(self) -> np.ndarray:
+        """Lower and upper corner of where the middles of objects are, from goal to drop [m] [2, 3]."""
+        ends = np.array([self.goal_m, self.drop_m])
+        around = WANDER_SHARE * self.fall_m
+        return np.stack([ends.min(axis=0) - around, ends.max(axis=0) + around])
 
 
 @dataclass(frozen=True)
@@ -309,16 +328,22 @@ class HandModel:
 
     @property
     def camera(self) -> CameraModel:
-        """The depth camera.
+        """The depth camera: the file's, or one that looks at where objects are handled.
 
-        Raises:
-            HandError: It has none.
+        That one is above a palm that looks up, and before one that looks down.
         """
-        if self.mounted_camera is None:
-            raise HandError(
-                f"{self.path}: {self.name} has no camera; add the prim base/camera (hand.md)"
-            )
-        return self.mounted_camera
+        if self.mounted_camera is not None:
+            return self.mounted_camera
+        x, _, z = np.eye(3)
+        away, up = (z, x) if self.palm_up else (x, z)
+        axes = np.column_stack([np.cross(up, away), -up, -away])
+        position = self.workspace.goal_m + CAMERA_M * away
+        pose = np.concatenate([position, Rotation.from_matrix(axes).as_quat()])
+        in_base = compose(invert(self.mount), pose)
+        near, far = RANGE_M
+        return CameraModel(
+            **vars(LENS), near=near, far=far, position=in_base[:3], quaternion=in_base[3:]
+        )
 
     @property
     def goal_in_base(self) -> np.ndarray:

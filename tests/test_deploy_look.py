@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop.policy_runner import load_runner
+from vd.deploy.loop.run import DriveCfg, _camera
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.agents import open_policy, task_for
@@ -89,6 +91,14 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     runner.look_by(LENS.seen_from(read_camera(hand, tmp_path / "camera.usda")))
     # Sideways in the base is level: the crop by height keeps the same pixels.
     np.testing.assert_allclose(np.sort(middle()[:, 1]), np.sort(before[:, 1]) + SHIFT_M, atol=1e-5)
+
+
+def test_a_real_camera_of_a_hand_without_one_needs_a_place():
+    blind = replace(load_hand("dclaw3"), mounted_camera=None)
+    runner = load_runner("dclaw3-tracking", "dclaw3", blind, load_set("cube")[0])
+    connection = SimpleNamespace(hand=blind, twin=None)
+    with pytest.raises(ValueError, match="--camera-layer"):
+        _camera(DriveCfg("dclaw3-tracking"), runner, connection)
 
 
 def falling():

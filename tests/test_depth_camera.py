@@ -212,6 +212,30 @@ def test_clouds_do_not_know_that_the_camera_has_moved(device, scenes):
         assert heights.min() > low - 1e-5 and heights.max() < high + 1e-5
 
 
+def test_clouds_know_the_place_that_was_drawn_for_the_camera(device, scenes):
+    """What is seen lies on what the camera sees from where it was meant to be."""
+    scene, state = scenes(device)
+    body_q = state.body_q.reshape((WORLDS, -1))
+    most = 0.02, 0.04
+    cfg = DepthCameraCfg(place_range=most, points=2000)
+    camera = DepthCamera.of_scene(scene, body_q, cfg, seed=1)
+    camera.capture()
+    poses = host(camera.extrinsics)
+    nominal = scene.hand.camera
+    about = Rotation.from_quat(nominal.quaternion)
+    shift = about.inv().apply(poses[:, :3] - nominal.position)
+    turn = (about.inv() * Rotation.from_quat(poses[:, 3:])).as_rotvec()
+    assert (np.abs(shift) < most[0] + 1e-6).all() and (np.abs(turn) < most[1] + 1e-5).all()
+    assert np.ptp(shift, axis=0).min() > 1e-3 and np.ptp(turn, axis=0).min() > 1e-3
+    for world in range(WORLDS):
+        cloud = host(camera.points)[world, : host(camera.count)[world]]
+        there = nominal.at(poses[world])
+        depth = host(camera.depth)[world]
+        column, row, away = there.project(cloud).T
+        seen = depth[row.astype(int), column.astype(int)]
+        np.testing.assert_allclose(seen, away, atol=1e-5)
+
+
 def test_late_images_are_past_images(device, scenes):
     scene, state = scenes(device)
     frame_s = 1.0 / PAPER.scene.control_hz

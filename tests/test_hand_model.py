@@ -1,6 +1,7 @@
 """The hands as read from USD, against numbers typed in here from the published tables."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -13,6 +14,7 @@ from hypothesis.extra import numpy as npst
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 from scipy.spatial.transform import Rotation
 
+from vd.assets_usd.hand_data import CAMERA_M, invert, placed
 from vd.assets_usd.hand_model import HandError, HandModel, open_stage, read_hand
 from vd.assets_usd.hands import hand_usd
 
@@ -315,10 +317,23 @@ def test_fingers_may_differ_and_joints_follow_others(
     assert builder.joint_mimic_coeffs[5] == pytest.approx((np.radians(10.0), 0.5))
 
 
-def test_a_camera_is_optional_until_it_is_needed(tmp_path: Path, four_fingers: HandModel) -> None:
+@pytest.mark.parametrize("up", [False, True])
+def test_without_a_camera_one_looks_at_where_objects_are_handled(
+    tmp_path: Path, four_fingers: HandModel, up: bool
+) -> None:
     blind = read_hand(edited(four_fingers.path, tmp_path, removing("base/camera")))
-    with pytest.raises(HandError, match=r"broken\.usda: dclaw4 has no camera; add the prim"):
-        blind.camera.at(None)
+    assert blind.mounted_camera is None
+    if up:
+        blind = replace(blind, mount=np.array([0.1, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0]))
+    assert blind.palm_up == up
+    camera = blind.camera
+    assert camera.project(blind.goal_in_base) == pytest.approx([160.0, 90.0, CAMERA_M])
+    away = placed(blind.mount, camera.position) - np.array(blind.workspace.goal_m)
+    assert away == pytest.approx([0.0, 0.0, CAMERA_M] if up else [CAMERA_M, 0.0, 0.0])
+    aside = np.array([0.05, 0.0, 0.05])
+    above = placed(invert(blind.mount), aside + blind.workspace.goal_m)
+    column, row, _ = camera.project(above)
+    assert column == pytest.approx(160.0) and row < 90.0, "the image is upright"
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path, four_fingers: HandModel) -> None:

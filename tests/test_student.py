@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -170,6 +171,19 @@ def senses_of(hand, envs: int, place: torch.device) -> Senses:
         goal_quat=random_rotations(envs, place),
         points=torch.full((envs, 4, 3), torch.nan, device=place),
         fresh=torch.ones(envs, dtype=torch.bool, device=place),
+    )
+
+
+def test_it_reads_no_joints_that_follow_others():
+    hand = load_hand("dclaw3")
+    mimic = np.array([-1, -1, 1, -1, -1, 4, -1, -1, 7])
+    build = InputBuilder(replace(hand, mimic=mimic), torch.zeros(2, 10, 3))
+    senses = senses_of(hand, 2, torch.device("cpu"))
+    sight = build(senses, build.first_belief(senses.goal_quat))
+    moved = np.flatnonzero(mimic < 0)
+    all_joints = InputBuilder(hand, torch.zeros(2, 10, 3))(senses, sight.belief).proprioception
+    torch.testing.assert_close(
+        sight.proprioception, all_joints.unflatten(-1, (3, 9))[..., moved].flatten(-2)
     )
 
 

@@ -3,6 +3,8 @@
 Hidden sides, the hand before and beside them, goals from scans.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,13 +14,11 @@ from vd.assets_usd.hands import load_hand
 from vd.evaluate.scanned import MISSING
 from vd.train.student.shapes import made_shapes
 from vd.train.student.views import (
-    CELL_M,
     TOUCH_M,
     Hands,
     draw_pairs,
     goal_points,
     posture_points,
-    random_joints,
     visible,
 )
 from vd.vision.rotations import turn_angle
@@ -50,7 +50,7 @@ def plates(hands, gap_m):
     [1, 800, 6].
     """
     middle = hands.box.mean(dim=0)
-    towards = torch.nn.functional.normalize(hands.eye - middle, dim=0)
+    towards = torch.nn.functional.normalize(hands.eye[0] - middle, dim=0)
     side = torch.nn.functional.normalize(torch.linalg.cross(towards, torch.eye(3)[2]), dim=0)
     grid = torch.stack(
         torch.meshgrid(*2 * [torch.linspace(-0.03, 0.03, 20)], indexing="ij"), -1
@@ -77,22 +77,25 @@ def test_what_is_before_hides_what_is_behind(hands, monkeypatch):
     assert not visible(hands, row, turned)[0].any(), "a surface shows its outside alone"
 
 
-def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand):
+@pytest.mark.parametrize("camera_range", [(0.0, 0.0), (0.05, 0.087)])
+def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand, camera_range):
     """Against a search through all of the hand's points, angle by angle."""
     torch.manual_seed(3)
-    one = Hands(hand, 1, device="cpu")
-    torch.manual_seed(3)
-    own = posture_points(hand, random_joints(hand, 1, "cpu"))[0].double().numpy()
+    one = Hands(hand, 1, camera_range=camera_range, device="cpu")
+    own = posture_points(hand, one.joints)[0].double().numpy()
     points = one.box[0] - 0.05 + (one.box[1] - one.box[0] + 0.1) * torch.rand(1, 1500, 3)
-    cell, depth = one.project(points)
-    free = one.free(torch.zeros(1, dtype=torch.long), points, cell, depth)[0].numpy()
-    camera = hand.camera
-    optical = Rotation.from_quat(camera.quaternion).inv()
-    at, there = (optical.apply(x - camera.position) for x in (points[0].double().numpy(), own))
+    row = torch.zeros(1, dtype=torch.long)
+    cell, depth = one.project(row, points)
+    free = one.free(row, points, cell, depth)[0].numpy()
+    eye = one.eye[0].double().numpy()
+    optical = Rotation.from_matrix(one._optical[0].numpy()).inv()
+    moved = np.abs(eye - hand.camera.position).max()
+    assert (moved > 0.005) == (camera_range[0] > 0.0)
+    at, there = (optical.apply(x - eye) for x in (points[0].double().numpy(), own))
     across = np.linalg.norm(
         (at[:, None, :2] / at[:, None, 2:] - there[None, :, :2] / there[None, :, 2:]), axis=-1
     )
-    width = CELL_M / float(((one.box.mean(dim=0) - one.eye) @ one._optical)[2])
+    width = float(one._cell[0])
     before = there[None, :, 2] < at[:, None, 2]
     hidden = (before & (across < 0.3 * width)).any(axis=1)
     clear = ~(before & (across < 1.5 * width)).any(axis=1)
@@ -125,6 +128,30 @@ def test_a_camera_elsewhere_sees_another_side(hand, monkeypatch):
         )[0]
         sides.append(float(ball[0, shown, 0].mean()))
     assert sides[0] > 0.2 and sides[1] < -0.2
+
+
+def test_objects_are_in_a_hand_that_holds_them_palm_up_and_joints_follow(hand):
+    factor = np.array([0.0, 0.0, 0.5] * 3)
+    mimic = np.array([-1, -1, 1, -1, -1, 4, -1, -1, 7])
+    place = replace(hand.workspace, goal_m=(0.1, 0.0, 0.25), drop_m=(0.1, 0.0, 0.28))
+    other = replace(
+        hand,
+        mount=np.array([0.1, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]),
+        workspace=place,
+        mounted_camera=None,
+        mimic=mimic,
+        mimic_factor=factor,
+    )
+    hands = Hands(other, 8, camera_range=(0.05, 0.087), device="cpu")
+    around = 0.4 * place.fall_m
+    expected = np.array([[0, 0, 0.15], [0, 0, 0.18]]) + around * np.array([[-1.0], [1.0]])
+    np.testing.assert_allclose(hands.box, expected, atol=1e-6)
+    torch.testing.assert_close(hands.joints[:, 2], 0.5 * hands.joints[:, 1])
+    # From above a ball's upper half is seen, by each camera.
+    ball = torch.nn.functional.normalize(torch.randn(8, 500, 3), dim=-1)
+    balls = torch.cat([hands.box.mean(0) + 0.03 * ball, ball], dim=-1)
+    shown = visible(hands, torch.arange(8), balls)
+    assert shown.any(dim=1).all() and ball[shown][:, 2].min() > -0.1
 
 
 def test_pairs_lie_as_they_say(hands, shapes):

@@ -392,7 +392,7 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
     from vd.deploy.camera.check_camera import camera_findings
 
     hand = connection.hand
-    if hand.mounted_camera is None:
+    if cfg.camera_layer is None and hand.mounted_camera is None:
         yield Finding("camera", True, f"{hand.name} has none")
         return
     place = hand.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)

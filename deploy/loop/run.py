@@ -359,6 +359,10 @@ def _camera(
 
     assert runner.camera is not None
     hand = connection.hand
+    if connection.twin is None and cfg.camera_layer is None and hand.mounted_camera is None:
+        raise ValueError(
+            f"{hand.name}'s file does not say where the camera is: --camera-layer (of vd-deploy calibrate)"
+        )
     camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
     where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
     runner.look_by(camera.intrinsics.seen_from(where))

@@ -59,7 +59,10 @@ def student_contract(
         task, observation=ObservationCfg(), randomisation=ReorientCfg.of(teacher).randomisation
     )
     spec = StudentSpec(
-        teacher=policy_name(str(cfg.teacher)), camera=cfg.camera, network=cfg.student
+        teacher=policy_name(str(cfg.teacher)),
+        camera=cfg.camera,
+        depth=DepthCameraCfg.of_hand(hand),
+        network=cfg.student,
     )
     actions = PolicySpec(
         num_observations=0,
@@ -128,7 +131,13 @@ def _made(
 ) -> tuple[MadeSequences, ActingStudent]:
     """Shapes without simulation, and the student at work on them."""
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
-    hands = Hands(hand, cfg.clouds.hands, camera=cfg.camera, device=device)
+    hands = Hands(
+        hand,
+        cfg.clouds.hands,
+        camera=cfg.camera,
+        camera_range=cfg.camera_range,
+        device=device,
+    )
     held_out = load_set(cfg.task.validation) if cfg.task.validation else []
     source = MadeSequences(load_set(task.objects), held_out, hands, cfg)
     goals = torch.zeros((cfg.learn.batch, cfg.clouds.points, 3), device=device)
@@ -147,7 +156,11 @@ def _simulated(
     env = ReorientVecEnv(simulation)
     camera = None
     if cfg.stage == RENDERED:
-        depth = replace(DepthCameraCfg().with_errors(), latency_s=cfg.simulated.latency_s)
+        depth = replace(
+            DepthCameraCfg.of_hand(simulation.hand).with_errors(),
+            latency_s=cfg.simulated.latency_s,
+            place_range=cfg.camera_range,
+        )
         camera = DepthCamera.of_scene(
             simulation.scene,
             simulation.sim.body_q,

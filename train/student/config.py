@@ -126,7 +126,10 @@ class StudentTrainCfg:
     a new run where there is none."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
-    and quaternion xyzw; the hand's own camera by default."""
+    and quaternion xyzw; the hand's own camera by default, or one that looks at where it holds objects."""
+    camera_range: tuple[float, float] = (0.05, 0.087)
+    """Stages 0 and 2: up to how far along [m], and turned about [rad], each of its axes a camera is from
+    there, each hand's another: a person's camera is never quite in the same place."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     student: StudentCfg = field(default_factory=StudentCfg)
     learn: LearnCfg = field(default_factory=LearnCfg)

@@ -103,11 +103,10 @@ class MadeSequences:
         middle = carried(goal.mean(dim=1, keepdim=True), rotation)[:, 0]
         truth = Belief(rotation, position + middle)
         joint_q = self._hands.joints[posture]
-        motors = count, acting.network.num_actions
         senses = Senses(
             joint_q=joint_q,
             joint_qd=torch.randn_like(joint_q),
-            action=uniform(-1.0, 1.0, *motors, device=device),
+            action=uniform(-1.0, 1.0, *joint_q.shape, device=device),
             goal_quat=acting.build.goal_quat(random_matrices(count, device)),
             points=self._seen(placed[:, self._clouds.points :], posture),
             fresh=torch.zeros(count, dtype=torch.bool, device=device),

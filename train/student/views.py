@@ -21,17 +21,14 @@ from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.evaluate.scanned import MISSING, NOISE_M
 from vd.geometry.arrays import as_warp
 from vd.geometry.clouds import HandCloud
+from vd.sensors.depth_camera import camera_places
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices_about
 from vd.vision.student import carried
 
-OBJECT_RANGE_M = ((-0.06, 0.06), (-0.06, 0.06), (0.02, 0.16))
-"""Where objects are, world frame: from the table to the palm, as wide as the claw opens."""
-WINDOW_M = 0.2
-"""Half the width of depth maps at the middle of that range: objects at its border fit in."""
 CELL_M = 0.007
-"""Width of a cell there: about the distance of points on a shape, so that few are seen through
-it.
+"""Width of a cell at the middle of where objects are: about the distance of points on a shape, so
+that few are seen through it.
 """
 SLACK_M = 0.012
 """How far a point may lie behind the nearest of its cell: as deep as a cell is on a steep face."""
@@ -85,33 +82,46 @@ class Hands:
 
     Args:
         hand: The hand, with its camera.
+        count: M.
         camera: Pose of the optical frame, position [m] and quaternion xyzw [7]; the hand's by
             default.
-        count: M.
+        camera_range: Up to how far along [m], and turned about [rad], each of its axes cameras are
+            from there, each posture's another.
         device: Warp device.
     """
 
     def __init__(
-        self, hand: HandModel, count: int, *, camera: tuple[float, ...] | None = None, device: str
+        self,
+        hand: HandModel,
+        count: int,
+        *,
+        camera: tuple[float, ...] | None = None,
+        camera_range: tuple[float, float] = (0.0, 0.0),
+        device: str,
     ) -> None:
         place = torch.device(wp.device_to_torch(device))
-        eye = hand.camera.at(camera)
+        generator = np.random.default_rng(int(torch.randint(2**31, (1,))))
+        eyes = camera_places(hand.camera.at(camera), count, camera_range, generator)
 
         def tensor(values: object) -> Tensor:
             return torch.tensor(np.asarray(values), dtype=torch.float32, device=place)
 
-        corners = np.array(OBJECT_RANGE_M).T
+        corners = hand.workspace.box_m
         poses = np.concatenate([corners, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))], axis=1)
         box = np.sort(compose(invert(hand.mount), poses)[:, :3], axis=0)
         self.box = tensor(box)
         """Corners of where objects are [2, 3]."""
         self.count = count
-        self.eye = tensor(eye.position)
-        self._optical = tensor(Rotation.from_quat(eye.quaternion).as_matrix())
-        middle = (self.box.mean(dim=0) - self.eye) @ self._optical
-        self._side = int(2 * WINDOW_M / CELL_M)
-        self._cell = CELL_M / middle[2]
-        self._corner = middle[:2] / middle[2] - 0.5 * self._side * self._cell
+        self.eye = tensor(eyes[:, :3])
+        """Where the camera of each posture is [M, 3]."""
+        self._optical = tensor(Rotation.from_quat(eyes[:, 3:]).as_matrix())
+        middle = self._in_camera(torch.arange(count, device=place), self.box.mean(dim=0))
+        away = middle[..., 2]
+        # Objects at the border of where they are fit in.
+        width = np.linalg.norm(corners[1] - corners[0]) + hand.workspace.size_m[1]
+        self._side = int(width / CELL_M)
+        self._cell = CELL_M / away
+        self._corner = middle[..., :2] / away[..., None] - 0.5 * self._side * self._cell[..., None]
         self._depth = torch.empty((count, self.cells), device=place)
         self._low = self.box[0] - REACH_M
         self._voxels = ((self.box[1] - self.box[0] + 2 * REACH_M) / TOUCH_M).ceil().long()
@@ -123,7 +133,7 @@ class Hands:
         """Joint positions of the postures [rad] [M, D]."""
         for rows in torch.arange(count, device=place).split(POSTURES_AT_ONCE):
             points = posture_points(hand, self.joints[rows])
-            cell, depth = self.project(points)
+            cell, depth = self.project(rows, points)
             self._depth[rows] = nearest(cell, depth, self.cells)
             self._near[rows[:, None], self._voxel(points)] = True
         self._depth[:, -1] = torch.inf  # what is outside
@@ -134,15 +144,23 @@ class Hands:
         """Cells of a depth map; the last is of all that is outside."""
         return self._side**2 + 1
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Cells of a depth map and depths [m] of points, [B, P] each."""
-        at = (points - self.eye) @ self._optical
+    def project(self, rows: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Cells of the depth maps of hands ``rows`` [B] and depths [m] of points, [B, P] each."""
+        at = self._in_camera(rows, points)
         depth = at[..., 2]
         place = at[..., :2] / depth[..., None]
-        cell = ((place - self._corner) / self._cell).floor().long()
+        cell = ((place - self._corner[rows]) / self._cell[rows, :, None]).floor().long()
         inside = ((cell >= 0) & (cell < self._side)).all(dim=-1) & (depth > 0.0)
         index = self._side * cell[..., 1] + cell[..., 0]
         return torch.where(inside, index, self.cells - 1), depth
+
+    def rays(self, rows: Tensor, points: Tensor) -> Tensor:
+        """Directions from the cameras of hands ``rows`` [B] to points [B, P, 3]."""
+        return normalize(points - self.eye[rows, None], dim=-1)
+
+    def _in_camera(self, rows: Tensor, points: Tensor) -> Tensor:
+        """Points [.., 3] in the optical frames of hands ``rows`` [B]: [B, P, 3] [m]."""
+        return (points - self.eye[rows, None]) @ self._optical[rows]
 
     def free(self, rows: Tensor, points: Tensor, cell: Tensor, depth: Tensor) -> Tensor:
         """Which points [B, P, 3] are neither behind nor beside the hands ``rows`` [B]; [B, P]."""
@@ -169,9 +187,13 @@ class Hands:
 def random_joints(hand: HandModel, count: int, device: str) -> Tensor:
     """Random joint positions within their limits [rad] [count, D]."""
     place = wp.device_to_torch(device)
-    lower = torch.tensor(hand.lower, dtype=torch.float32, device=place)
-    upper = torch.tensor(hand.upper, dtype=torch.float32, device=place)
-    return uniform(lower, upper, count, len(lower), device=place)
+
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=place)
+
+    joints = uniform(tensor(hand.lower), tensor(hand.upper), count, hand.num_joints, device=place)
+    followed = joints[:, hand.mimic] * tensor(hand.mimic_factor) + tensor(hand.mimic_offset)
+    return torch.where(torch.tensor(hand.mimic >= 0, device=place), followed, joints)
 
 
 def posture_points(hand: HandModel, joints: Tensor) -> Tensor:
@@ -202,9 +224,9 @@ def visible(hands: Hands, rows: Tensor, shapes: Tensor) -> Tensor:
         shapes: Points [m] and normals [B, P, 6].
     """
     points = shapes[..., :3]
-    ray = normalize(points - hands.eye, dim=-1)
+    ray = hands.rays(rows, points)
     facing = (shapes[..., 3:] * ray).sum(dim=-1) < FACING
-    cell, depth = hands.project(points)
+    cell, depth = hands.project(rows, points)
     front = torch.where(facing, depth, torch.inf)
     shown = facing & (depth < nearest(cell, front, hands.cells).gather(1, cell) + SLACK_M)
     free = shown & hands.free(rows, points, cell, depth)
@@ -230,7 +252,7 @@ def camera_points(hands: Hands, rows: Tensor, shapes: Tensor, count: int) -> Ten
     chosen = drawn(kept.float(), count)
     seen = points.take_along_dim(chosen[..., None], dim=1)
     std = DEPTH_STD_M * torch.rand((batch, 1, 1), device=device)
-    ray = normalize(seen - hands.eye, dim=-1)
+    ray = hands.rays(rows, seen)
     noise = POINT_STD_M * torch.randn_like(seen)
     return seen + noise + std * torch.randn((batch, count, 1), device=device) * ray
 

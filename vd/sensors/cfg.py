@@ -5,6 +5,7 @@ By default a perfect camera at the hand's viewpoint.
 
 from dataclasses import dataclass, field, replace
 
+from vd.assets_usd.hand_data import HandModel
 from vd.command.config import require
 from vd.paper import PAPER
 
@@ -15,6 +16,8 @@ length
 LATENCY_S = (1.0 / 30.0, 2.0 / 30.0)
 """Age of images at 30 Hz, as vd-deploy asks for [s]: one period to take and send, and up to one
 until it is read (an assumption; the data sheet gives none)."""
+ABOVE_M = 0.12
+"""Points count up to so far above where objects are handled [m]: with the D'Claw up to its palm."""
 POSITION_NOISE_M, ROTATION_NOISE_RAD = 0.001, 0.002
 """What a calibration leaves of the camera's place along and about each axis: 2 mm in the median at
 an object half a metre away, as of 20 views of one finger."""
@@ -95,10 +98,19 @@ class DepthCameraCfg:
     clouds do not know."""
     rotation_noise_rad: float = 0.0
     """Standard deviation of its orientation about each axis [rad], likewise."""
+    place_range: tuple[float, float] = (0.0, 0.0)
+    """Up to how far the camera is from its place along [m], and turned about [rad], each of its own
+    axes, one even draw an environment; clouds know."""
     latency_s: tuple[float, float] = (0.0, 0.0)
     """Range of the images' age [s], drawn evenly for each environment."""
     sensor: DepthSensorCfg = field(default_factory=DepthSensorCfg)
     """Errors of the measured depth."""
+
+    @classmethod
+    def of_hand(cls, hand: HandModel) -> "DepthCameraCfg":
+        """The same camera for a hand: its points reach as far above where objects are handled."""
+        crop_m = PAPER.camera.crop_m[0], hand.workspace.goal_m[2] + ABOVE_M
+        return cls(crop_m=crop_m)
 
     def with_errors(self) -> "DepthCameraCfg":
         """The same camera as a D415.

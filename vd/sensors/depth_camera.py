@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import CameraModel
+from vd.assets_usd.hand_data import CameraModel, compose
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.sensor.depth_cloud import next_frame_kernel
@@ -106,11 +106,12 @@ class DepthCamera:
         generator.standard_normal(n)  # keeps the viewpoints that a seed has had
         self.views = make_views(camera, n, device)
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
+        believed = camera_places(camera, n, cfg.place_range, np.random.default_rng([seed, 1]))
         self.extrinsics = wp.array(
-            _extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device
+            _extrinsics(believed, generator, cfg), dtype=wp.transform, device=device
         )
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
-        self._believed = _believed(camera, cfg, self.extrinsics)
+        self._believed = self._as_believed(believed)
         self.sensors = wp.array(
             [_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device
         )
@@ -141,6 +142,12 @@ class DepthCamera:
         self._history: wp.array | None = None
         if cfg.latency_s[1] > 0.0:
             self._remember_poses(math.ceil(cfg.latency_s[1] / frame_s) + 1)
+
+    def _as_believed(self, places: np.ndarray) -> wp.array:
+        """Extrinsics as calibrated [N]: places before noise [N, 7]; without noise the same array."""
+        if not (self.cfg.position_noise_m > 0.0 or self.cfg.rotation_noise_rad > 0.0):
+            return self.extrinsics
+        return wp.array(places, dtype=wp.transform, device=self.device)
 
     def _remember_poses(self, slots: int) -> None:
         """Allocate the body poses of the last ``slots`` frames, of which late images are made."""
@@ -267,25 +274,32 @@ def _table_box() -> tuple[wp.vec3, wp.vec3]:
     return wp.vec3(-0.5 * x, -0.5 * y, top - z), wp.vec3(0.5 * x, 0.5 * y, top)
 
 
+def camera_places(
+    camera: CameraModel, count: int, most: tuple[float, float], generator: np.random.Generator
+) -> np.ndarray:
+    """Poses of cameras about a given one, in the base frame [count, 7].
+
+    Args:
+        camera: The given one.
+        count: How many.
+        most: Up to how far along [m], and turned about [rad], each of its axes, evenly.
+        generator: What draws.
+    """
+    moved = generator.uniform(-1.0, 1.0, (2, count, 3))
+    turn = Rotation.from_rotvec(most[1] * moved[1])
+    change = np.concatenate([most[0] * moved[0], turn.as_quat()], axis=1)
+    return compose(np.concatenate([camera.position, camera.quaternion]), change)
+
+
 def _extrinsics(
-    camera: CameraModel, generator: np.random.Generator, cfg: DepthCameraCfg, n: int
+    believed: np.ndarray, generator: np.random.Generator, cfg: DepthCameraCfg
 ) -> np.ndarray:
     """Poses of the optical frames [N, 7], the turn about the camera's own axes."""
-    turn = Rotation.from_rotvec(cfg.rotation_noise_rad * generator.standard_normal((n, 3)))
-    position = camera.position + cfg.position_noise_m * generator.standard_normal((n, 3))
-    return np.concatenate(
-        [position, (Rotation.from_quat(camera.quaternion) * turn).as_quat()], axis=1
-    )
-
-
-def _believed(camera: CameraModel, cfg: DepthCameraCfg, extrinsics: wp.array) -> wp.array:
-    """Extrinsics as calibrated, before they are randomised; the same array if they are not."""
-    if not (cfg.position_noise_m > 0.0 or cfg.rotation_noise_rad > 0.0):
-        return extrinsics
-    nominal = np.concatenate([camera.position, camera.quaternion])
-    return wp.array(
-        np.tile(nominal, (len(extrinsics), 1)), dtype=wp.transform, device=extrinsics.device
-    )
+    shape = len(believed), 3
+    turn = Rotation.from_rotvec(cfg.rotation_noise_rad * generator.standard_normal(shape))
+    position = believed[:, :3] + cfg.position_noise_m * generator.standard_normal(shape)
+    orientation = Rotation.from_quat(believed[:, 3:]) * turn
+    return np.concatenate([position, orientation.as_quat()], axis=1)
 
 
 def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:

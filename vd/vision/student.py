@@ -12,8 +12,8 @@ encoded at once if its beliefs are those of the rollout: training stores them be
 :class:`StudentInput`, as data through which no gradient flows, and teaches the shifts from each
 stored belief to the truth.
 
-N environments, T steps, R looks, V voxels of goals in all of them, D joints and actions, E the
-embedding, G the memory. Base frame of the hand; metres, radians.
+N environments, T steps, R looks, V voxels of goals in all of them, D joints of which A have motors
+and so actions, E the embedding, G the memory. Base frame of the hand; metres, radians.
 """
 
 from collections.abc import Callable
@@ -78,7 +78,7 @@ class StudentInput:
     goal_rotation: Tensor
     """Wanted rotation, from the cloud's own axes to the base frame, matrices [.., 3, 3]."""
     proprioception: Tensor
-    """Joint positions and velocities, scaled, and the last action [.., 3 D]."""
+    """Positions and velocities of joints with motors, scaled, and the last action [.., 3 A]."""
     belief: Belief
     """What the step before left."""
 
@@ -118,9 +118,9 @@ class StudentOutput:
     """What a student says of a step; leading axes [N] or [T, N], the memory's [N]."""
 
     mean: Tensor
-    """Mean of the action, not clipped [.., D]."""
+    """Mean of the action, not clipped [.., A]."""
     log_std: Tensor
-    """Logarithm of its standard deviation [.., D]."""
+    """Logarithm of its standard deviation [.., A]."""
     belief: Belief
     """The better belief; detached it is the next step's."""
     log_distance: Tensor
@@ -203,6 +203,7 @@ class InputBuilder:
 
         self._to_base = quaternion_matrices(constant(hand.mount[3:])).T
         self._place = constant(hand.goal_in_base)
+        self._moved = torch.tensor(hand.actuated, device=device)
         self._lower = constant(hand.lower)
         self._range = constant(hand.upper - hand.lower)
 
@@ -264,12 +265,13 @@ class InputBuilder:
         self._cloud.pose(as_warp(joint_q), links)
         position = 2.0 * (joint_q - self._lower) / self._range - 1.0
         velocity = PAPER.observation.velocity_scale * senses.joint_qd
+        moved = torch.stack([position, velocity, senses.action])[..., self._moved]
         return StudentInput(
             camera=senses.points,
             hand=wp.to_torch(self._cloud(links)),
             goal=self._goals if rows is None else self._goals[rows],
             goal_rotation=self.goal_rotation(senses.goal_quat),
-            proprioception=torch.cat([position, velocity, senses.action], dim=-1),
+            proprioception=torch.cat(tuple(moved), dim=-1),
             belief=belief,
         )
 
@@ -305,7 +307,7 @@ class Student(nn.Module):
 
     Args:
         cfg: Its sizes.
-        num_actions: D.
+        num_actions: A.
 
     Attributes:
         half: The stages multiply in bfloat16 while weights stay in single precision.
