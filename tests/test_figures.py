@@ -15,7 +15,7 @@ from test_evaluate_trace import compared
 from vd.bench.cli import Command, main
 from vd.command.files import write_json
 from vd.command.line import parse
-from vd.command.versions import GAP, code_fingerprint
+from vd.command.versions import GAP, MEASURING, code_fingerprint
 from vd.evaluate import suite_run
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.result import Result
@@ -180,4 +180,9 @@ def test_code_is_known_by_its_statements(tmp_path, monkeypatch):
         assert digest("x = 2\n") != first
         (tmp_path / "page.py").write_text("y = 1\n")
         assert digest("x = 1\n") == first, "what shows a result does not measure it"
+        (tmp_path / "shown" / "sheet.py").write_text("y = 1\n")
+        assert digest("x = 1\n") == first, "in folders, too"
+        (tmp_path / "hand.usda").write_text("mass = 1\n")
+        assert digest("x = 1\n") != first, "a hand is measured"
+    assert "assets_usd" in MEASURING, "what imports decides what is measured"
     code_fingerprint.cache_clear()

@@ -16,7 +16,7 @@ from gap_recordings import recorded
 from test_first_hour import SCRIPTS
 
 from vd.assets_usd.hand_layer import write_layer
-from vd.assets_usd.hands import load_hand
+from vd.assets_usd.hands import hand_usd, load_hand
 from vd.command.files import locked
 from vd.deploy.loop.goals import drawn_goals
 from vd.evaluate.statistics import symmetric_error
@@ -46,6 +46,7 @@ LONG = {
     "vd-deploy --twin": "vd.deploy.loop.policy_runner.load_runner",
     "vd-deploy --hand dclaw3": "vd.deploy.loop.policy_runner.load_runner",
     "vd-deploy --hand dclaw4": "vd.deploy.loop.policy_runner.load_runner",
+    "vd-deploy --hand leap --twin": "vd.deploy.loop.policy_runner.load_runner",
     "vd-eval": "vd.evaluate.cli._evaluate",
     "vd-eval --hand dclaw3": "vd.evaluate.cli._evaluate",
     "vd-play": "vd.play.cli._session",
@@ -66,6 +67,7 @@ TAKEN = {
     "vd-deploy --twin": "dclaw3-vision --hand dclaw3 --object cube --twin   (3 goals)",
     "vd-deploy --hand dclaw3": "dclaw3-vision --hand dclaw3 --object cube --port {}/ttyUSB0",
     "vd-deploy --hand dclaw4": "dclaw4-vision --hand dclaw4 --object cube --port {}/ttyUSB0",
+    "vd-deploy --hand leap --twin": "leap-cube --hand leap --object cube --twin",
     "vd-eval": "vd-eval dclaw4 --objects cube --episodes 20 --out runs/eval",
     "vd-eval --hand dclaw3": "vd-eval dclaw3 --objects cube",
     "vd-play": "vd-play dclaw4 --objects cube",
@@ -91,6 +93,16 @@ def typed(tmp_path, monkeypatch, capsys):
     return run
 
 
+@pytest.fixture
+def leap(tmp_path, monkeypatch):
+    """A hand that was imported as ``leap``: a D'Claw, since LEAP's files are not here."""
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "assets"))
+    folder = tmp_path / "assets" / "hands" / "leap"
+    folder.mkdir(parents=True)
+    text = hand_usd("dclaw3").read_text().replace("dclaw3", "leap")
+    (folder / "leap.usda").write_text(text)
+
+
 def reached(*_args, **_kwargs):
     """Stands for what takes long."""
     raise ReachedError
@@ -98,7 +110,7 @@ def reached(*_args, **_kwargs):
 
 @pytest.mark.parametrize("line", LONG)
 def test_a_command_typed_alone_takes_the_obvious_and_says_it(
-    line, typed, tmp_path, monkeypatch, capsys
+    line, typed, leap, tmp_path, monkeypatch, capsys
 ):
     (tmp_path / "ttyUSB0").touch()
     hand = load_hand("dclaw3")
@@ -148,6 +160,14 @@ def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, mon
     assert default_policy("leap", "vision", "tracking", "teacher") == "leap-cube"
     with pytest.raises(ValueError, match=r"no vision or tracking policy of leap .*leap-objects"):
         default_policy("leap", "vision", "tracking")
+
+
+def test_a_hand_of_teachers_alone_names_them(typed, leap, tmp_path):
+    status, said = typed("vd-deploy --hand leap")
+    assert status == 1 and "no serial adapter" in said and "--twin" in said
+    (tmp_path / "ttyUSB0").touch()
+    status, said = typed("vd-deploy --hand leap")
+    assert status == 1 and "no vision or tracking policy of leap" in said and "leap-cube" in said
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,9 @@ from vd.kernels.servo.chains import DIVERGED, rollout_kernel
 from vd.kernels.servo.effects import EFFECTS, neutral_row
 
 DT = 1 / 480
-FINE = 10
-"""The oracle's steps in one of the kernel's."""
-FINE_PROFILE = 4
-"""Steps of the oracle's profile in one of its own: a profile that brakes too late overshoots by its
-steps, which in one of them alone adds up to 3.4 mrad."""
+FINE = 40
+"""The oracle's steps in one of the kernel's. It is of first order: with ten of them it is itself
+off by 0.8 mrad where friction falls with speed, with these by 0.1."""
 PLAIN = {servo.KP: 3.0, servo.KD: 0.3, servo.VELOCITY_LIMIT: 50.0, servo.INERTIA: 2e-3}
 GRAVITY = np.array([1.0, -2.0, 9.0])
 
@@ -220,7 +218,6 @@ def integrate(rows, time, command, start, dt, stops=np.inf):
     history = [q]
     mass = p["INERTIA"] + p["PAYLOAD_INERTIA"]
     on = {name: p[name] > 0 for name in p}
-    part = dt / FINE_PROFILE
     for k in range(int(np.ceil(time[-1] / dt)) + 1):
         t = k * dt
         write = np.searchsorted(time, t + 0.5 * dt - p["COMMAND_DELAY"], side="right") - 1
@@ -229,14 +226,12 @@ def integrate(rows, time, command, start, dt, stops=np.inf):
         smooth = smooth + dt / tau * (reference - smooth)
         reference = np.where(on["FILTER_TAU"], smooth, reference)
         a = np.where(on["ACCELERATION_LIMIT"], p["ACCELERATION_LIMIT"], 1.0)
-        for _ in range(FINE_PROFILE):
-            to_go = np.abs(reference - profile)
-            target_speed = np.minimum(np.sqrt(2 * a * to_go), to_go / part)
-            target_speed = np.copysign(target_speed, reference - profile)
-            profile_speed = profile_speed + np.clip(
-                target_speed - profile_speed, -a * part, a * part
-            )
-            profile = profile + part * profile_speed
+        to_go, part = np.abs(reference - profile), 0.5 * a * dt
+        # Of n steps that each take a * dt from the speed: to_go is a * dt^2 * n (n + 1) / 2.
+        target_speed = np.minimum(np.sqrt(part**2 + 2 * a * to_go) - part, to_go / dt)
+        target_speed = np.copysign(target_speed, reference - profile)
+        profile_speed = profile_speed + np.clip(target_speed - profile_speed, -a * dt, a * dt)
+        profile = profile + dt * profile_speed
         reference = np.where(on["ACCELERATION_LIMIT"], profile, reference)
         played = np.clip(
             played, reference - p["BACKLASH_WIDTH"] / 2, reference + p["BACKLASH_WIDTH"] / 2

@@ -8,12 +8,24 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "policy", "evaluate")
+MEASURING = (
+    "kernels",
+    "assets_usd",
+    "sim",
+    "envs",
+    "sensors",
+    "tracking",
+    "vision",
+    "policy",
+    "evaluate",
+)
 """Packages that decide what an evaluation gives."""
 GAP = ("kernels", "logs", "gap")
 """Packages that decide what the gap workflow finds."""
-SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py", "store.py")
-"""Files in them that only ask and show."""
+SHOWING = frozenset(
+    ["cli.py", "page.py", "sheet.py", "claims.py", "suite.py", "suite_run.py", "store.py", "suites"]
+)
+"""Files and folders in them that only ask and show."""
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
@@ -31,7 +43,8 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
 def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
     """What tells the code that measures from other code: a digest of its packages' statements.
 
-    Comments, docstrings and empty lines do not count, nor does where it is installed.
+    Hands and their descriptions count too. Comments, docstrings and empty lines of modules do not,
+    nor does where it is installed.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -39,11 +52,14 @@ def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
         assert spec is not None
         assert spec.submodule_search_locations is not None
         (folder,) = spec.submodule_search_locations
-        for file in sorted(Path(folder).rglob("*.py")):
-            name = file.relative_to(folder).as_posix()
-            if name not in SHOWING:
-                statements = _statements(file.read_text(encoding="utf-8"))
-                digest.update(f"{package}/{name}\n{statements}\n".encode())
+        for file in sorted(Path(folder).rglob("*.*")):
+            name = file.relative_to(folder)
+            if file.suffix not in (".py", ".usda", ".yaml") or SHOWING.intersection(name.parts):
+                continue
+            text = file.read_text(encoding="utf-8")
+            if file.suffix == ".py":
+                text = _statements(text)
+            digest.update(f"{package}/{name.as_posix()}\n{text}\n".encode())
     return digest.hexdigest()[:16]
 
 
