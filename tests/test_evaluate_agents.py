@@ -190,7 +190,7 @@ def test_evaluation_at_rest_of_the_installed_policy_beats_doing_nothing(tmp_path
         np.testing.assert_allclose(one.goal_quat, other.goal_quat, atol=1e-3)
     assert all(e.start_error_rad <= 1.0 + 1e-3 for e in trained)
     assert sum(e.stopped for e in trained) >= 6 > sum(e.stopped for e in zero)
-    assert (tmp_path / "eval.html").stat().st_size > 20_000
+    assert "dclaw4-cube" in (tmp_path / "eval.html").read_text()
     again = ["--device", "cpu", "--out", str(tmp_path / "again")]
     assert main(["zero", "--at-rest", *flags, *again]) == 0
     assert [row.episodes for row in Result.read(tmp_path / "again" / "eval.json").rows][1] == zero
