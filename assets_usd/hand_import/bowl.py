@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import CollisionShape, HandModel, Workspace, compose
 from vd.paper import PAPER
 
+# All numbers of this search are ours, chosen so that it takes a minute, and not tuned.
 OBJECTS = 32
 """Half of them spheres, half cubes, of even sizes."""
 POSES = 24
@@ -25,14 +26,17 @@ POSES = 24
 BEST = 6
 """Of these by which the next are drawn."""
 ROUNDS = 12
+"""Of draws about the best."""
 FALL_S = 1.5
-"""After which an object that is still there stays."""
+"""After which an object that is still there stays [s]."""
 STEP_S = 0.004
+"""Of the physics [s]."""
 BENT = 0.3
 """Share of the way to the farther end of its range by which a joint bends in the first round."""
 SPREAD = 0.2
 """Standard deviation of the first round, of a joint's range."""
 LEAST_SPREAD = 0.03
+"""Standard deviation that every round has at least, of a joint's range."""
 NEAR = 0.1
 """How much of an object it is worth that all objects lie at the goal: tells equals apart."""
 TOUCH_M = 0.0005
@@ -40,6 +44,7 @@ TOUCH_M = 0.0005
 RISE_M = 0.005
 """Steps by which what would start in the hand is raised."""
 THREADS = 2
+"""Poses scored at a time: as many cores as the smallest machines have. Changes no result."""
 
 
 class Drops:

@@ -17,10 +17,10 @@ from vd.vision.student import Belief, InputBuilder, Student, StudentInput, Stude
 LEAST_SEEN = 32
 """Points from which an object is looked for (ours): fewer tell little of its shape. Not tuned."""
 PASSES = 3
-"""Times that each start of a first look is made better. Not tuned: after three of the first
-trials' passes errors hardly fell."""
+"""Times that each start of a first look is made better (ours). Chosen on the validation meshes: after
+three the median error of 1.2 rad at most hardly falls; half and twice were not tried at work."""
 AT_ONCE = 4096
-"""Looks at a time."""
+"""Looks at a time (ours): what the cells of more take counts in gigabytes. Changes no result."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,8 @@ class ActingStudent:
         if begin is None:
             seen = torch.isfinite(senses.points).all(dim=-1).sum(dim=1) >= LEAST_SEEN
             found = (self.lost & seen).nonzero()[:, 0]
-            self._search(senses, found)
+            if len(found):
+                self._search(senses, found)
             self.lost = self.lost & ~seen
         else:
             self.lost = torch.zeros_like(self.lost)
