@@ -106,15 +106,13 @@ class SimulatedSequences:
             self._keep(step, senses, acting.belief, pose, label)
             output = acting.decide(sight)
             turn, shift = belief_errors(output.belief, acting.build.belief_of(pose))
-            std = output.log_std.exp()
-            noise = torch.randn_like(output.mean)
-            _, _, _, extras = self.env.step(output.mean + std * noise)
+            _, _, _, extras = self.env.step(output.mean)
             self._means.add(
                 {
                     "student/rotation_error": turn.mean(),
                     "student/position_error_mm": 1e3 * shift.mean(),
                     "student/action_error": (output.mean - label).abs().mean(),
-                    "policy/std": std.mean(),
+                    "policy/std": output.log_std.exp().mean(),
                     **extras["log"],
                 }
             )
