@@ -16,6 +16,7 @@ from vd.policy.senses import Senses
 from vd.train.student.sequences import Sequences, flow_loss
 from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
+from vd.vision.inputs import Belief, HandFrames, InputBuilder, StudentInput, carried, each
 from vd.vision.rotations import (
     matrices_about,
     quaternion_matrices,
@@ -23,19 +24,10 @@ from vd.vision.rotations import (
     turn_angle,
 )
 from vd.vision.sparse import voxelise
-from vd.vision.student import (
-    Belief,
-    Flow,
-    InputBuilder,
-    Look,
-    Student,
-    StudentInput,
-    carried,
-    each,
-    rigid_motion,
-)
+from vd.vision.student import Flow, Look, Student, rigid_motion
 
 JOINTS = 9
+TIPS = 3
 SMALL = StudentCfg(
     channels=(8, 16), blocks=1, embedding=32, flow=32, senses=16, memory=32, head=32, voxel_m=0.01
 )
@@ -70,14 +62,16 @@ def sights(lead: tuple[int, ...], seed: int = 0, points: int = 60) -> StudentInp
         goal=goal,
         goal_rotation=quaternion_matrices(random_rotations(count, cpu)),
         proprioception=torch.randn((count, 3 * JOINTS), generator=generator),
+        tips=0.05 * torch.randn((count, TIPS, 3), generator=generator),
         belief=Belief(believed, position),
+        frame=torch.zeros(count, dtype=torch.int64),
     )
     return each(sight, lambda value: value.unflatten(0, lead))
 
 
 def student(cfg: StudentCfg = SMALL, seed: int = 0) -> Student:
     torch.manual_seed(seed)
-    return Student(cfg, JOINTS).eval()
+    return Student(cfg, JOINTS, TIPS).eval()
 
 
 def test_without_weights_it_does_nothing_and_believes_what_it_did():
@@ -88,7 +82,7 @@ def test_without_weights_it_does_nothing_and_believes_what_it_did():
     for seed in range(2):
         sight = sights((2, 3), seed)
         output = network(sight, network.first_hidden(3))
-        assert not output.mean.any()
+        assert not output.action.any()
         torch.testing.assert_close(output.belief.rotation, sight.belief.rotation)
         torch.testing.assert_close(output.belief.position, sight.belief.position)
         assert (output.log_distance == 0.0).all()
@@ -100,11 +94,13 @@ def test_what_it_says_depends_on_every_thing_that_it_reads():
     output = network.act(sight, network.first_hidden(2))
     other = sights((2,), seed=1)
     for field in dataclasses.fields(StudentInput):
+        if field.name == "frame":  # which only tells how the rest is given
+            continue
         changed = dataclasses.replace(sight, **{field.name: getattr(other, field.name)})
         found = network.act(changed, network.first_hidden(2))
-        assert (found.mean != output.mean).any(dim=1).all(), field.name
+        assert (found.action != output.action).any(dim=1).all(), field.name
     remembered = network.act(sight, output.hidden)
-    assert (remembered.mean != output.mean).any(dim=1).all()
+    assert (remembered.action != output.action).any(dim=1).all()
 
 
 def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
@@ -117,7 +113,7 @@ def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
     for step in range(4):
         output = network.act(each(sight, lambda value, step=step: value[step]), hidden)
         hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
-        for name in ("mean", "log_std", "log_distance"):
+        for name in ("action", "log_distance"):
             found = getattr(output, name)
             torch.testing.assert_close(found, getattr(whole, name)[step], atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(output.belief.rotation, whole.belief.rotation[step])
@@ -205,6 +201,8 @@ def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(devic
     tip = sight.hand[0].cpu().numpy().reshape(len(hand.point_link), -1, 3)
     for link, points in zip(hand.point_link, tip, strict=True):
         assert np.abs(points - poses[0, link, :3]).max() < 0.12
+    tips = hand.tip_poses(senses.joint_q.cpu().numpy())[..., :3]
+    np.testing.assert_allclose(sight.tips.cpu(), tips, atol=1e-5)
     # An object where it is believed to be fills the goal's voxels, and no others.
     seen = carried(goals, belief.rotation, belief.position[:, None])
     mean = goals.mean(dim=1, keepdim=True)
@@ -215,6 +213,55 @@ def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(devic
     twice = build(each_row(senses, [1, 0]), each(belief, lambda v: v.flip(0)), torch.tensor([1, 0]))
     torch.testing.assert_close(twice.goal, sight.goal.flip(0))
     torch.testing.assert_close(twice.hand, sight.hand.flip(0))
+
+
+def test_a_scene_turned_from_finger_to_finger_is_read_the_same():
+    """Against a turn of the world that is made here."""
+    hand = load_hand("dclaw3")
+    envs = 40
+    torch.manual_seed(2)
+    goals = 0.03 * torch.randn(envs, 30, 3)
+    build = InputBuilder(hand, goals)
+    senses = senses_of(hand, envs, torch.device("cpu"))
+    senses = replace(senses, points=0.1 * torch.randn(envs, 20, 3))
+    rotation = quaternion_matrices(random_rotations(envs, torch.device("cpu")))
+    belief = Belief(rotation, 0.05 * torch.randn(envs, 3))
+    sight = build(senses, belief)
+    assert sight.frame.unique().tolist() == [0, 1, 2]
+    third = Rotation.from_euler("z", 120.0, degrees=True)
+    to_world = Rotation.from_quat(hand.mount[3:])
+    base = to_world.inv() * third * to_world
+    turn = torch.tensor(base.as_matrix()).float()
+    goal = third * Rotation.from_quat(senses.goal_quat.numpy())
+    rest = hand.tip_poses(np.zeros(9))[:, :3]
+    apart = np.linalg.norm(base.apply(rest)[:, None] - rest[None], axis=2)
+    fingers = apart.argmin(axis=0)  # which finger comes to the place of each
+    order = (3 * fingers[:, None] + np.arange(3)).ravel()
+    moved = Senses(
+        joint_q=senses.joint_q[:, order],
+        joint_qd=senses.joint_qd[:, order],
+        action=senses.action[:, order],
+        goal_quat=torch.tensor(goal.as_quat()).float(),
+        points=carried(senses.points, turn),
+        fresh=senses.fresh,
+    )
+    again = build(moved, Belief(turn @ rotation, belief.position @ turn.T))
+    assert (again.frame != sight.frame).all()
+    for name in ("camera", "goal_rotation", "proprioception", "tips"):
+        torch.testing.assert_close(getattr(again, name), getattr(sight, name), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(again.belief.rotation, sight.belief.rotation)
+    torch.testing.assert_close(again.belief.position, sight.belief.position)
+    # What is done there is done by the other fingers.
+    action = torch.randn(envs, 9)
+    done = build.frames.joints_out(action, sight.frame)
+    torch.testing.assert_close(build.frames.joints_out(action, again.frame), done[:, order])
+
+
+def test_a_hand_whose_fingers_differ_is_read_in_its_base_frame():
+    hand = load_hand("dclaw3")
+    uneven = replace(hand, mount=hand.mount + np.array([0.05, 0, 0, 0, 0, 0, 0]))
+    frames = HandFrames(uneven, torch.device("cpu"))
+    torch.testing.assert_close(frames.turn, torch.eye(3)[None])
 
 
 def test_a_belief_strays_no_farther_than_the_network_sees():
@@ -315,9 +362,10 @@ class Told(torch.nn.Module):
 
     cfg = SMALL
 
-    def __init__(self, truth: torch.Tensor):
+    def __init__(self, truth: torch.Tensor, frames: HandFrames):
         super().__init__()
         self.truth = truth
+        self.frames = frames
 
     def first_hidden(self, envs: int) -> torch.Tensor:
         """No memory."""
@@ -326,9 +374,10 @@ class Told(torch.nn.Module):
     def look(self, sight: StudentInput) -> Look:
         """The truth where the belief is near it."""
         rotation = sight.belief.rotation
-        near = turn_angle(rotation.mT @ self.truth) < 1.15
-        better = torch.where(near[:, None, None], self.truth, rotation)
-        doubt = turn_angle(better.mT @ self.truth)
+        truth = self.frames.turn[sight.frame] @ self.truth
+        near = turn_angle(rotation.mT @ truth) < 1.15
+        better = torch.where(near[:, None, None], truth, rotation)
+        doubt = turn_angle(better.mT @ truth)
         return Look(doubt, Belief(better, sight.belief.position), doubt, doubt, None)
 
 
@@ -336,7 +385,8 @@ def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
     hand = load_hand("dclaw3")
     senses = senses_of(hand, 2, torch.device("cpu"))
     truth = quaternion_matrices(random_rotations(1, torch.device("cpu")))[0]
-    acting = ActingStudent(Told(truth), hand, torch.randn(2, 50, 3))
+    told = Told(truth, HandFrames(hand, truth.device))
+    acting = ActingStudent(told, hand, torch.randn(2, 50, 3))
     middle = torch.tensor([0.01, -0.02, 0.16])
     seen = middle + 0.02 * torch.randn(2, 40, 3)
     seen[1] = torch.nan
@@ -362,10 +412,10 @@ def test_it_learns_in_half_precision(device):
     single = network(sight, network.first_hidden(3))
     network.half = True
     output = network(sight, network.first_hidden(3))
-    assert output.mean.dtype == output.belief.rotation.dtype == torch.float32
-    torch.testing.assert_close(output.mean, single.mean, atol=0.02, rtol=0.02)
-    assert (output.mean != single.mean).any()
-    spoken = [output.mean, output.log_std, output.log_distance]
+    assert output.action.dtype == output.belief.rotation.dtype == torch.float32
+    torch.testing.assert_close(output.action, single.action, atol=0.02, rtol=0.02)
+    assert (output.action != single.action).any()
+    spoken = [output.action, output.log_distance]
     spoken += [output.flow.shift, output.flow.log_scale]
     sum(value.square().sum() for value in spoken).backward()
     for name, weight in network.named_parameters():
@@ -380,7 +430,7 @@ def test_a_robot_runs_its_stages_in_half_precision():
         single = network.act(sight, network.first_hidden(2))
         network.stages.bfloat16()
         output = network.act(sight, network.first_hidden(2))
-    torch.testing.assert_close(output.mean, single.mean, atol=0.02, rtol=0.02)
+    torch.testing.assert_close(output.action, single.action, atol=0.02, rtol=0.02)
     assert output.hidden.dtype == torch.float32
 
 
@@ -389,12 +439,15 @@ def test_a_robot_needs_no_simulator():
 import sys, torch
 from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
-from vd.vision.student import Belief, StudentInput, Student
+from vd.vision.inputs import Belief, StudentInput
+from vd.vision.student import Student
 belief = Belief(torch.eye(3)[None], torch.zeros(1, 3))
 points = torch.rand(1, 5, 3)
-sight = StudentInput(points, points, points, belief.rotation, torch.zeros(1, 9), belief)
-student = Student(StudentCfg(channels=(8,), blocks=0), 3).eval()
-print(student.act(sight, student.first_hidden(1)).mean.shape[1], *sys.modules)
+joints = torch.zeros(1, 9)
+frame = torch.zeros(1).long()
+sight = StudentInput(points, points, points, belief.rotation, joints, points, belief, frame)
+student = Student(StudentCfg(channels=(8,), blocks=0), 3, 5).eval()
+print(student.act(sight, student.first_hidden(1)).action.shape[1], *sys.modules)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     printed = run.stdout.split()
@@ -415,4 +468,4 @@ print(student.act(sight, student.first_hidden(1)).mean.shape[1], *sys.modules)
 )
 def test_refuses_sizes_that_make_no_network(change, field):
     with pytest.raises(ValueError, match=f"student.{field}"):
-        Student(dataclasses.replace(SMALL, **change), JOINTS)
+        Student(dataclasses.replace(SMALL, **change), JOINTS, TIPS)

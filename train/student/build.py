@@ -102,7 +102,7 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
 
 def _network(cfg: StudentTrainCfg, teacher: TrainedPolicy, device: str) -> Student:
     """The student, with the weights of the one that it begins from."""
-    network = Student(cfg.student, teacher.num_actions).to(device)
+    network = Student(cfg.student, teacher.num_actions, teacher.contract.num_tips).to(device)
     if cfg.init is not None:
         policy = open_student(str(cfg.init), device)
         if policy.hand != teacher.hand:

@@ -42,7 +42,7 @@ class LearnCfg:
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the convolutions' products."""
     action_weight: float = 1.0
-    """Of the negative logarithm of the likelihood of the teacher's action, a mean over motors."""
+    """Of the squared error of the teacher's action, a mean over motors."""
     flow_weight: float = 1.0
     """Of the negative logarithm of the likelihood of the goal's shifts, a mean over voxels."""
     distance_weight: float = 0.1
@@ -89,6 +89,9 @@ class SimulatedCfg:
 
     epochs: int = 1
     """Passes over what was done in an iteration."""
+    led_share: float = 0.5
+    """Share of the environments in which the teacher acts, and the student only watches: it learns
+    nothing of what it never comes to, and by itself comes to little at first."""
     blank_probability: float = 0.02
     """Stage 2: chance in a step that the camera goes blank for a while."""
     blank_steps: int = 8
@@ -99,7 +102,7 @@ class SimulatedCfg:
     def validate(self) -> None:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
         require(self, "--simulated.", "positive", "epochs blank_steps")
-        require(self, "--simulated.", "in [0, 1]", "blank_probability")
+        require(self, "--simulated.", "in [0, 1]", "blank_probability led_share")
 
 
 @dataclass

@@ -19,8 +19,8 @@ from vd.train.student.sequences import Sequences, belief_errors
 from vd.train.student.shapes import random_matrices, uniform
 from vd.train.student.views import Hands, camera_points, goal_points, posed
 from vd.vision.acting import PASSES, ActingStudent
+from vd.vision.inputs import Belief, carried, each
 from vd.vision.rotations import matrices_about
-from vd.vision.student import Belief, carried, each
 
 CLOUDS = 4
 """Points of a shape, in clouds: one is the goal's, of the others is seen what is to be seen."""
@@ -112,6 +112,7 @@ class MadeSequences:
             fresh=torch.zeros(count, dtype=torch.bool, device=device),
         )
         sight = acting.build(senses, off(truth))
+        truth = acting.build.frames.belief_in(truth, sight.frame)
 
         def as_step(value: Tensor) -> Tensor:
             return value[None]

@@ -1,5 +1,7 @@
 """What a student learns from: sequences of steps, with the truth about each, and their losses.
 
+All of it is in the frame of each step (:mod:`vd.vision.inputs`).
+
 T steps, B sequences, N environments, D actions.
 """
 
@@ -10,16 +12,9 @@ from torch import Tensor
 
 from vd.policy.senses import Senses
 from vd.train.student.config import LearnCfg
+from vd.vision.inputs import Belief, InputBuilder, StudentInput, carried, each
 from vd.vision.rotations import turn_angle
-from vd.vision.student import (
-    SHIFT_M,
-    Belief,
-    InputBuilder,
-    StudentInput,
-    StudentOutput,
-    carried,
-    each,
-)
+from vd.vision.student import SHIFT_M, StudentOutput
 
 LEAST_DISTANCE_RAD = 0.02
 """Distances to the goal below this count as this: nothing is stopped as near."""
@@ -90,6 +85,6 @@ def student_losses(output: StudentOutput, sequences: Sequences, cfg: LearnCfg) -
         "distance": cfg.distance_weight * (output.log_distance - distance.log()).square().mean(),
     }
     if sequences.label is not None:
-        off = (sequences.label - output.mean) * (-output.log_std).exp()
-        losses["action"] = cfg.action_weight * (0.5 * off.square() + output.log_std).mean()
+        off = sequences.label - output.action
+        losses["action"] = cfg.action_weight * off.square().mean()
     return losses

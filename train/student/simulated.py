@@ -27,8 +27,8 @@ from vd.train.student.sequences import Sequences, belief_errors, inputs_of
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
+from vd.vision.inputs import Belief, carried, each
 from vd.vision.rotations import quaternion_matrices
-from vd.vision.student import Belief, carried, each
 
 
 class SimulatedSequences:
@@ -70,8 +70,11 @@ class SimulatedSequences:
         goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
         self.goals = self._scale * goals
         self._shapes = surfaces[:, points:]
+        self._all = wp.ones(env.num_envs, dtype=wp.int32, device=env.env.device)
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
+        led = round(cfg.simulated.led_share * env.num_envs)
+        self._led = torch.arange(env.num_envs, device=place)[:, None] < led
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
         self._store: dict[str, Tensor] = {}
         self._means = StepMeans()
@@ -106,13 +109,17 @@ class SimulatedSequences:
             self._keep(step, senses, acting.belief, pose, label)
             output = acting.decide(sight)
             turn, shift = belief_errors(output.belief, acting.build.belief_of(pose))
-            _, _, _, extras = self.env.step(output.mean)
+            action = torch.where(self._led, label, output.action)
+            _, _, _, extras = self.env.step(action)
+            frames = self.env.env.symmetry_frames
+            if frames is not None:  # the teacher's, in every step anew as the student's
+                frames.choose(self._all, self._all)
+                frames.observe()
             self._means.add(
                 {
                     "student/rotation_error": turn.mean(),
                     "student/position_error_mm": 1e3 * shift.mean(),
-                    "student/action_error": (output.mean - label).abs().mean(),
-                    "policy/std": output.log_std.exp().mean(),
+                    "student/action_error": (output.action - label).abs().mean(),
                     **extras["log"],
                 }
             )
@@ -159,13 +166,16 @@ class SimulatedSequences:
             points = kept["points"].float()
         senses = Senses(**(kept | {"points": points}))
         fresh = kept["fresh"]
-        truth = acting.build.belief_of(poses, of_poses)
+        sight = inputs_of(acting.build, senses, belief, rows)
+        frames = acting.build.frames
+        frame = sight.frame.flatten()
+        truth = frames.belief_in(acting.build.belief_of(poses, of_poses), frame)
         return Sequences(
-            sight=inputs_of(acting.build, senses, belief, rows),
+            sight=sight,
             truth=each(truth, lambda value: value.unflatten(0, (steps, len(rows)))),
             hidden=hidden[rows].masked_fill(fresh[0, :, None], 0.0),
             done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
-            label=label,
+            label=frames.joints_in(label.flatten(0, 1), frame).unflatten(0, label.shape[:2]),
         )
 
     def figures(self) -> dict[str, Any]:

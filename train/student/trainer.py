@@ -16,7 +16,8 @@ from vd.train.student.sequences import Sequences, last_errors, student_losses
 from vd.train.student.simulated import SimulatedSequences
 from vd.train.supervised import SupervisedLoop
 from vd.vision.acting import ActingStudent, StudentPolicy
-from vd.vision.student import Belief, Student, each
+from vd.vision.inputs import Belief, each
+from vd.vision.student import Student
 
 
 class StudentTrainer(SupervisedLoop):
@@ -119,7 +120,7 @@ class StudentTrainer(SupervisedLoop):
         self.source.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
-        network = Student(self.network.cfg, self.network.num_actions)
+        network = Student(self.network.cfg, self.network.num_actions, self.network.num_tips)
         network.load_state_dict(state["student_state_dict"])
         network.eval().requires_grad_(False)
         contract = replace(self.contract, iterations=self.iteration, env_steps=self.env_steps)

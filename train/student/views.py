@@ -23,8 +23,8 @@ from vd.geometry.arrays import as_warp
 from vd.geometry.clouds import HandCloud
 from vd.sensors.depth_camera import camera_places
 from vd.train.student.shapes import drawn, random_matrices, uniform
+from vd.vision.inputs import carried
 from vd.vision.rotations import matrices_about
-from vd.vision.student import carried
 
 CELL_M = 0.007
 """Width of a cell at the middle of where objects are: about the distance of points on a shape, so

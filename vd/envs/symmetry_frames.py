@@ -57,6 +57,8 @@ class SymmetryFrames:
     """The direction near which a frame has the axis of the wanted rotation, as it is in the world
     [V, 3].
     """
+    turn: np.ndarray
+    """Turn or reflection of the world that makes each [V, 3, 3]."""
 
 
 def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) -> SymmetryFrames:
@@ -93,6 +95,7 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
         sign=np.stack([_joint_signs(turn, fingers, each) for turn in turns]),
         # An axis of rotation looks the other way in a mirror.
         sector=np.stack([np.linalg.det(turn) * turn.T @ direction for turn in turns]),
+        turn=np.stack(turns),
     )
 
 

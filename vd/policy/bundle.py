@@ -21,8 +21,9 @@ from vd.policy.contract import (
 )
 from vd.tracking.policy import TrackingPolicy
 from vd.vision.acting import StudentPolicy
+from vd.vision.inputs import Belief, StudentInput
 from vd.vision.saved import alignment_network
-from vd.vision.student import Belief, Student, StudentInput
+from vd.vision.student import Student
 
 STATES = 8
 """Golden observations of a teacher, or pairs of clouds."""
@@ -131,7 +132,8 @@ def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
     """The policy of a contract with weights."""
     on_device = {name: value.to(device) for name, value in tensors.items()}
     if contract.student is not None:
-        network = Student(contract.student.network, contract.network.num_actions).to(device)
+        actions = contract.network.num_actions
+        network = Student(contract.student.network, actions, contract.num_tips).to(device)
         network.load_state_dict(_part(on_device, "student."))
         return StudentPolicy(network.eval().requires_grad_(False), contract)
     teacher = TrainedPolicy(
@@ -150,14 +152,15 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
     """Inputs to which the outputs are known.
 
     Of a teacher's layers ``observation`` [S, O] of size 1. Of a network of alignment
-    ``goal_points`` and ``seen_points`` [S, G, 3] about their means [m]. Of a student three clouds
-    and ``proprioception`` [S, 3 D].
+    ``goal_points`` and ``seen_points`` [S, G, 3] about their means [m]. Of a student three clouds,
+    ``tips`` [S, F, 3] and ``proprioception`` [S, 3 D].
     """
     rng = np.random.default_rng(0)
     drawn: dict[str, np.ndarray] = {}
     if isinstance(policy, StudentPolicy):
         for name in ("camera", "hand", "goal"):
             drawn[name] = rng.normal(scale=GOLDEN_M, size=(STATES, GOLDEN_POINTS, 3))
+        drawn["tips"] = rng.normal(scale=GOLDEN_M, size=(STATES, policy.contract.num_tips, 3))
         drawn["proprioception"] = rng.normal(size=(STATES, 3 * policy.num_actions))
     else:
         drawn["observation"] = rng.normal(size=(STATES, policy.num_observations))
@@ -203,11 +206,13 @@ def _student_answers(network: Student, golden: Tensors) -> Tensors:
         goal=golden["goal"],
         goal_rotation=rotation,
         proprioception=golden["proprioception"],
+        tips=golden["tips"],
         belief=Belief(rotation, torch.zeros((STATES, 3))),
+        frame=torch.zeros(STATES, dtype=torch.int64),
     )
     with torch.no_grad():
         output = network.act(sight, network.first_hidden(STATES))
-    return {"action": output.mean, "rotation": output.belief.rotation}
+    return {"action": output.action, "rotation": output.belief.rotation}
 
 
 def _part(tensors: Tensors, prefix: str) -> Tensors:

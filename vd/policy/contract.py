@@ -133,6 +133,11 @@ class Contract:
         """How it sees; None for a teacher."""
         return self.student or self.tracking
 
+    @property
+    def num_tips(self) -> int:
+        """Fingertips of the hand."""
+        return len(self.interface["hand"]["tips_in_base"])
+
 
 class Contracted:
     """A policy, of which its contract says this."""

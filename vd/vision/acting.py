@@ -1,6 +1,6 @@
 """Students at work: what they believe and remember from step to step, in a simulator or on a robot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Literal
 
@@ -11,8 +11,9 @@ from vd.assets_usd.hand_data import HandModel
 from vd.geometry.quaternions import product, rotated
 from vd.policy.contract import Contract, Contracted, StudentSpec
 from vd.policy.senses import CameraDecision, Senses
+from vd.vision.inputs import Belief, InputBuilder, StudentInput, each
 from vd.vision.rotations import cube_rotations
-from vd.vision.student import Belief, InputBuilder, Student, StudentInput, StudentOutput, each
+from vd.vision.student import Student, StudentOutput
 
 LEAST_SEEN = 32
 """Points from which an object is looked for (ours): fewer tell little of its shape. Not tuned."""
@@ -116,20 +117,24 @@ class ActingStudent:
             position = senses.points[some].nanmean(dim=1)
             belief = Belief(rotation.flatten(0, 1), position.repeat_interleave(starts, dim=0))
             for _ in range(PASSES):
-                look = self.network.look(self.build(now, belief, every))
-                belief = look.belief
+                sight = self.build(now, belief, every)
+                look = self.network.look(sight)
+                belief = self.build.frames.belief_out(look.belief, sight.frame)
             best = look.doubt.unflatten(0, (-1, starts)).argmin(dim=1)
             chosen = torch.arange(len(some), device=some.device) * starts + best
             self.belief.rotation[some] = belief.rotation[chosen]
             self.belief.position[some] = belief.position[chosen]
 
     def decide(self, sight: StudentInput) -> StudentOutput:
-        """What the network says, which is believed and remembered from then on."""
+        """What the network says, in the base frame, which is believed and remembered from then on."""
         output = self.network.act(sight, self.hidden)
+        frames = self.build.frames
+        belief = frames.belief_out(output.belief, sight.frame)
         # One that strayed would have nothing in sight to come back by.
-        self.belief = self.build.near_place(output.belief, self.network.cfg.reach_m)
+        self.belief = self.build.near_place(belief, self.network.cfg.reach_m)
         self.hidden = output.hidden
-        return output
+        action = frames.joints_out(output.action, sight.frame)
+        return replace(output, action=action, belief=belief)
 
     @torch.no_grad()
     def step(self, senses: Senses) -> CameraDecision:
@@ -138,7 +143,7 @@ class ActingStudent:
         pose = self.pose
         turn = self._base[:, 3:]
         return CameraDecision(
-            action=output.mean,
+            action=output.action,
             angle=output.log_distance.exp(),
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),

@@ -51,12 +51,12 @@ class StudentCfg:
     """Width of what one look shows."""
     flow: int = 256
     """Width of the layers that predict by how much the goal's voxels are to move."""
-    senses: int = 128
+    senses: int = 256
     """Width of the layers that read joints, last action and belief."""
     memory: int = 256
     """Width of the GRU."""
-    head: int = 256
-    """Width of the layer before action and distance."""
+    head: int = 512
+    """Width of the layers before action and distance."""
     voxel_m: float = PAPER.cloud.voxel_m
     """Side of a voxel [m]."""
     reach_m: float = 0.12

@@ -7,42 +7,34 @@ The network predicts for each voxel of the goal by how much it is to move, and h
 rigid motion that fits these shifts best makes the belief better, and the network acts on that. A
 GRU carries over steps what one look does not show.
 
+What it then believes is told its memory and its head as numbers: how far the fingertips are from
+the goal's cloud laid there, how far that extends, and the wanted rotation.
+
 The voxels of a step depend on the belief that the step before left. So a sequence can only be
 encoded at once if its beliefs are those of the rollout: training stores them beside the rest of a
 :class:`StudentInput`, as data through which no gradient flows, and teaches the shifts from each
 stored belief to the truth.
 
-N environments, T steps, R looks, V voxels of goals in all of them, D joints of which A have motors
-and so actions, E the embedding, G the memory. Base frame of the hand; metres, radians.
+N environments, T steps, R looks, V voxels of goals in all of them, A actions, F fingertips, E the
+embedding, G the memory. The frames of :mod:`vd.vision.inputs`; metres, radians.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from itertools import pairwise
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
 
-import numpy as np
 import torch
-import warp as wp
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
-from vd.assets_usd.hand_data import HandModel
-from vd.geometry.arrays import as_warp
-from vd.geometry.clouds import HandCloud
-from vd.paper import PAPER
-from vd.policy.senses import Senses
 from vd.vision.cfg import StudentCfg
-from vd.vision.rotations import first_columns, matrices, quaternion_matrices, quaternions
+from vd.vision.inputs import Belief, StudentInput, carried, each
+from vd.vision.rotations import first_columns, matrices
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
 
 KINDS = 3
 """Kinds of points: of the camera, of the hand, of the goal."""
 PLACE_M = 0.1
 """Unit of places and offsets [m]: about the size of the scene."""
-LOG_STD = (-4.0, 0.0)
-"""Least and largest logarithm of an action's standard deviation, as wide as teachers' are."""
-UNSURE = 2.2
-"""Bias of the deviation at first: near the largest, or the gradient were the first actions' alone."""
 BELIEVED = 9
 """Numbers of a belief: two columns of a rotation, and a place."""
 SHIFT_M = 0.01
@@ -51,36 +43,12 @@ LOG_SCALE = (-3.0, 3.0)
 """Least and largest logarithm of that deviation: from 0.5 mm to 20 cm."""
 LEAST_M = 1e-4
 """Goals are as if they were this wide at least [m], for what cannot be told."""
-
-Step = TypeVar("Step", "StudentInput", "StudentOutput", "Belief", Senses)
-
-
-@dataclass(frozen=True)
-class Belief:
-    """Where a goal's cloud is believed to lie on the object; leading axes [N] or [T, N]."""
-
-    rotation: Tensor
-    """From the cloud's own axes to the base frame, matrices [.., 3, 3]."""
-    position: Tensor
-    """Of the cloud's mean [m] [.., 3]."""
-
-
-@dataclass(frozen=True)
-class StudentInput:
-    """What a student reads of a step; leading axes [N] or [T, N]."""
-
-    camera: Tensor
-    """What the camera sees, or complete surfaces; NaN for none [.., K, 3]."""
-    hand: Tensor
-    """The hand's own points by its joints [.., H, 3]."""
-    goal: Tensor
-    """The goal's cloud about its mean, in its own axes [.., P, 3]."""
-    goal_rotation: Tensor
-    """Wanted rotation, from the cloud's own axes to the base frame, matrices [.., 3, 3]."""
-    proprioception: Tensor
-    """Positions and velocities of joints with motors, scaled, and the last action [.., 3 A]."""
-    belief: Belief
-    """What the step before left."""
+NEAR_M = 0.02
+"""Unit of distances to the surface and of how far it extends [m]: fingertips are so far from it."""
+EXTENT_M = 0.05
+"""Subtracted from how far the surface extends [m]: about its mean over objects."""
+DIRECTIONS = tuple(way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way))
+"""Directions in which it is told how far the surface extends: to the neighbours of a cell."""
 
 
 @dataclass(frozen=True)
@@ -117,10 +85,8 @@ class Look:
 class StudentOutput:
     """What a student says of a step; leading axes [N] or [T, N], the memory's [N]."""
 
-    mean: Tensor
-    """Mean of the action, not clipped [.., A]."""
-    log_std: Tensor
-    """Logarithm of its standard deviation [.., A]."""
+    action: Tensor
+    """The action, not clipped [.., A]."""
     belief: Belief
     """The better belief; detached it is the next step's."""
     log_distance: Tensor
@@ -131,24 +97,6 @@ class StudentOutput:
     """Memory after the last step [N, G]."""
     flow: Flow
     """The shifts of all steps."""
-
-
-def each(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
-    """A step with every tensor changed, such as indexed; a flow stays."""
-    values: dict[str, Any] = {}
-    for field in fields(step):
-        value = getattr(step, field.name)
-        if isinstance(value, Belief):
-            value = each(value, change)
-        elif not isinstance(value, Flow):  # which has no rows of steps
-            value = change(value)
-        values[field.name] = value
-    return type(step)(**values)
-
-
-def carried(points: Tensor, rotation: Tensor, position: Tensor | float = 0.0) -> Tensor:
-    """Points [.., P, 3] turned by matrices [.., 3, 3] and shifted by [.., 1, 3]: P R^T + p."""
-    return points @ rotation.mT + position
 
 
 @torch.no_grad()
@@ -183,99 +131,6 @@ def rigid_motion(flow: Flow, looks: int) -> tuple[Tensor, Tensor]:
     return rotation, to_middle - carried(from_middle[:, None], rotation)[:, 0]
 
 
-class InputBuilder:
-    """Makes what a student reads of what N hands sense.
-
-    Args:
-        hand: The hand.
-        goals: Clouds of the goals, in their own axes and of true size [m] [N, P, 3].
-    """
-
-    def __init__(self, hand: HandModel, goals: Tensor):
-        device = goals.device
-        links = np.arange(len(hand.link_names))
-        self.set_goals(goals)
-        self._cloud = HandCloud(hand, link_body=links, device=str(device))
-        self._links = len(links)
-
-        def constant(values: np.ndarray) -> Tensor:
-            return torch.tensor(values, dtype=torch.float32, device=device)
-
-        self._to_base = quaternion_matrices(constant(hand.mount[3:])).T
-        self._place = constant(hand.goal_in_base)
-        self._moved = torch.tensor(hand.actuated, device=device)
-        self._lower = constant(hand.lower)
-        self._range = constant(hand.upper - hand.lower)
-
-    def set_goals(self, goals: Tensor) -> None:
-        """Take other clouds."""
-        middle = goals.mean(dim=1)
-        self._middle = middle
-        self._goals = goals - middle[:, None]
-
-    def goal_rotation(self, goal_quat: Tensor) -> Tensor:
-        """Wanted rotations in the base frame [R, 3, 3], of quaternions in the world's [R, 4]."""
-        return self._to_base @ quaternion_matrices(goal_quat)
-
-    def goal_quat(self, rotation: Tensor) -> Tensor:
-        """The inverse of :meth:`goal_rotation`."""
-        return quaternions(self._to_base.T @ rotation)
-
-    def first_belief(self, goal_quat: Tensor) -> Belief:
-        """What is believed of an object before it is seen.
-
-        It is turned as it is wanted and lies where objects are handled.
-        """
-        rotation = self.goal_rotation(goal_quat)
-        return Belief(rotation, self._place.repeat(len(goal_quat), 1))
-
-    def near_place(self, belief: Belief, reach_m: float) -> Belief:
-        """A belief whose place is at most ``reach_m`` from where objects are handled."""
-        offset = belief.position - self._place
-        length = offset.norm(dim=-1, keepdim=True)
-        share = reach_m / length.clamp(min=reach_m)
-        position = self._place + offset * share
-        return Belief(belief.rotation, position)
-
-    def belief_of(self, pose: Tensor, rows: Tensor | None = None) -> Belief:
-        """What is to be believed of objects at poses in the base frame [R, 7]; ``rows`` as below."""
-        middle = self._middle if rows is None else self._middle[rows]
-        rotation = quaternion_matrices(pose[:, 3:])
-        position = carried(middle[:, None], rotation, pose[:, None, :3])
-        return Belief(rotation, position[:, 0])
-
-    def pose_of(self, belief: Belief) -> Tensor:
-        """Where the frames of the objects of all environments are believed to be [N, 7]."""
-        middle = carried(self._middle[:, None], belief.rotation)[:, 0]
-        orientation = quaternions(belief.rotation)
-        return torch.cat([belief.position - middle, orientation], dim=1)
-
-    def __call__(self, senses: Senses, belief: Belief, rows: Tensor | None = None) -> StudentInput:
-        """What is read of R steps.
-
-        Args:
-            senses: What was sensed, R rows; instead of what a camera sees ``points`` may hold
-                complete surfaces (:func:`carried`).
-            belief: What was believed before [R].
-            rows: Environment of each row [R]; row i is of environment i by default.
-        """
-        joint_q = senses.joint_q
-        poses = joint_q.new_empty((len(joint_q), self._links, 7))
-        links = as_warp(poses, wp.transform)
-        self._cloud.pose(as_warp(joint_q), links)
-        position = 2.0 * (joint_q - self._lower) / self._range - 1.0
-        velocity = PAPER.observation.velocity_scale * senses.joint_qd
-        moved = torch.stack([position, velocity, senses.action])[..., self._moved]
-        return StudentInput(
-            camera=senses.points,
-            hand=wp.to_torch(self._cloud(links)),
-            goal=self._goals if rows is None else self._goals[rows],
-            goal_rotation=self.goal_rotation(senses.goal_quat),
-            proprioception=torch.cat(tuple(moved), dim=-1),
-            belief=belief,
-        )
-
-
 class VoxelStage(nn.Module):
     """A convolution of stride 2, BN and residual blocks on the coarser cells.
 
@@ -308,16 +163,18 @@ class Student(nn.Module):
     Args:
         cfg: Its sizes.
         num_actions: A.
+        num_tips: F.
 
     Attributes:
         half: The stages multiply in bfloat16 while weights stay in single precision.
     """
 
-    def __init__(self, cfg: StudentCfg, num_actions: int):
+    def __init__(self, cfg: StudentCfg, num_actions: int, num_tips: int):
         super().__init__()
         cfg.validate()
         self.cfg = cfg
         self.num_actions = num_actions
+        self.num_tips = num_tips
         self.half = False
         widths = (4 * KINDS + 3, *cfg.channels)
         self.stages = nn.Sequential()
@@ -325,7 +182,7 @@ class Student(nn.Module):
             self.stages.append(VoxelStage(inputs, outputs, cfg.blocks))
         self.project = nn.Sequential(
             nn.Linear(2 * widths[-1], cfg.embedding),
-            nn.ReLU(),
+            nn.LayerNorm(cfg.embedding),
         )
         self.flow = nn.Sequential(
             nn.Linear(sum(widths[1:]) + 2 * widths[-1] + 6, cfg.flow),
@@ -334,24 +191,28 @@ class Student(nn.Module):
             nn.GELU(),
             nn.Linear(cfg.flow, 4),
         )
+        ways = torch.tensor(DIRECTIONS)
+        self.register_buffer("directions", normalize(ways, dim=1), persistent=False)
+        told = 3 * num_actions + BELIEVED + 1 + 3 * num_tips + 2 * len(ways)
         self.senses = nn.Sequential(
-            nn.Linear(3 * num_actions + BELIEVED + 1, cfg.senses),
+            nn.Linear(told, cfg.senses),
             nn.GELU(),
             nn.Linear(cfg.senses, cfg.senses),
+            nn.LayerNorm(cfg.senses),
         )
         self.memory = nn.GRU(cfg.embedding + cfg.senses, cfg.memory)
         self.head = nn.Sequential(
-            nn.Linear(cfg.memory + BELIEVED, cfg.head),
+            nn.Linear(cfg.memory + cfg.senses, cfg.head),
+            nn.GELU(),
+            nn.Linear(cfg.head, cfg.head),
             nn.GELU(),
         )
-        self.mean = nn.Linear(cfg.head, num_actions)
-        self.log_std = nn.Linear(cfg.head, num_actions)
-        nn.init.constant_(self.log_std.bias, UNSURE)
+        self.action = nn.Linear(cfg.head, num_actions)
         self.log_distance = nn.Linear(cfg.head, 1)
 
     def first_hidden(self, envs: int) -> Tensor:
         """The memory where an episode begins: zeros [N, G]."""
-        return self.mean.weight.new_zeros((envs, self.cfg.memory))
+        return self.action.weight.new_zeros((envs, self.cfg.memory))
 
     def look(self, sight: StudentInput) -> Look:
         """What R looks show, and a better belief. Waits for the device."""
@@ -434,18 +295,14 @@ class Student(nn.Module):
             return value.unflatten(0, lead)
 
         better = each(flat.belief, of_steps)
-        believed = self._believed(better, sight.goal_rotation)
         doubt = of_steps(flat.doubt.detach())[..., None]
-        sensed = self.senses(torch.cat([sight.proprioception, believed, doubt], dim=-1))
+        told = [sight.proprioception, doubt, self._believed(sight, better)]
+        sensed = self.senses(torch.cat(told, dim=-1))
         inputs = torch.cat([of_steps(flat.embedding), sensed], dim=-1)
         remembered, hidden = self._remember(inputs, hidden, done)
-        features = self.head(torch.cat([remembered, believed], dim=-1))
-        low, high = LOG_STD
-        mean = self.mean(features)
-        share = torch.sigmoid(self.log_std(features))
+        features = self.head(torch.cat([remembered, sensed], dim=-1))
         return StudentOutput(
-            mean=mean,
-            log_std=low + (high - low) * share,
+            action=self.action(features),
             belief=better,
             log_distance=self.log_distance(features).squeeze(-1),
             voxels=of_steps(flat.voxels),
@@ -465,11 +322,23 @@ class Student(nn.Module):
         far = points.norm(dim=-1, keepdim=True) > self.cfg.reach_m
         return points.masked_fill(far, torch.nan)
 
-    def _believed(self, belief: Belief, goal_rotation: Tensor) -> Tensor:
-        """From the goal to the object as two columns, and the object's place [.., 9]."""
-        turn = belief.rotation @ goal_rotation.mT
-        place = belief.position / PLACE_M
-        return torch.cat([first_columns(turn), place], dim=-1)
+    def _believed(self, sight: StudentInput, belief: Belief) -> Tensor:
+        """From the goal to the object as two columns, its place, and its surface [.., 9 + 3 F + 52].
+
+        Of the surface: the way from each fingertip to the nearest point, and how far it extends
+        from its middle in :data:`DIRECTIONS`, as it lies and as it is to lie.
+        """
+        turn = belief.rotation @ sight.goal_rotation.mT
+        laid = carried(sight.goal, belief.rotation)
+        wanted = carried(sight.goal, sight.goal_rotation)
+        tips = sight.tips - belief.position[..., None, :]
+        nearest = torch.cdist(tips, laid).argmin(dim=-1, keepdim=True)
+        way = laid.gather(-2, nearest.expand_as(tips)) - tips
+        told = [first_columns(turn), belief.position / PLACE_M, way.flatten(-2) / NEAR_M]
+        for cloud in (laid, wanted):
+            extent = (cloud @ self.directions.T).amax(dim=-2)
+            told.append((extent - EXTENT_M) / NEAR_M)
+        return torch.cat(told, dim=-1)
 
     def _remember(
         self, inputs: Tensor, hidden: Tensor, done: Tensor | None
