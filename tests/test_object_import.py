@@ -349,6 +349,38 @@ def test_a_mesh_of_many_faces_is_simplified_and_its_error_said(
     assert off.max() < 1.5e-2 * said * 0.12
 
 
+IMPORT_AND_MEASURE = """
+import resource, subprocess, sys
+subprocess.run([sys.executable, "-m", "vd.assets_usd.cli", "import", *sys.argv[1:]], check=True)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss)
+"""
+"""Prints the processor time [s] and the largest resident memory [kB] of an import.
+
+A process of its own, since what it starts would begin with the memory of the tests.
+"""
+
+
+@pytest.mark.slow
+def test_a_scan_takes_no_more_time_and_memory_than_two_million_faces_may(tmp_path: Path):
+    """They may take a minute of two cores and 2 GB; a sixth of their faces takes half of that."""
+    scan = trimesh.creation.icosphere(subdivisions=7, radius=0.06)
+    scan.vertices[:, :2] *= 0.8 + 0.3 * np.cos(70.0 * scan.vertices[:, 2:])
+    scan.export(tmp_path / "vase.stl")
+    command = [sys.executable, "-c", IMPORT_AND_MEASURE, str(tmp_path / "vase.stl")]
+    run = subprocess.run(
+        [*command, "--out", str(tmp_path / "out"), "--jobs", "1"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    processor_s, memory_kb = map(float, run.stdout.split()[-2:])
+    assert len(scan.faces) == 327_680
+    assert processor_s < 60.0
+    assert memory_kb < 1e6
+    assert read_object(tmp_path / "out" / "vase.usd").warnings == ()
+
+
 def with_antenna(closed: bool = True) -> trimesh.Trimesh:
     """A box of three different sides, and off its middle a rod 2 mm thick and 30 mm long."""
     body = trimesh.creation.box((0.12, 0.06, 0.03))
