@@ -292,8 +292,8 @@ def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
 
 def test_shapes_are_renewed_from_the_oldest(scenes):
     bank, *_ = scenes
-    before = bank._shapes.clone()
+    before = bank.shapes.clone()
     bank.renew(3)
     bank.renew(4)
-    same = (bank._shapes == before).flatten(1).all(dim=1)
+    same = (bank.shapes == before).flatten(1).all(dim=1)
     assert int((~same).sum()) == 7

@@ -141,7 +141,7 @@ def test_a_blocked_motor_shuts_down_and_says_why_until_rebooted(bus, twin):
 def test_a_program_that_did_not_run_is_not_called_a_lost_cable(starved_s):
     hand = load_hand("dclaw3")
     with simulated_bus(hand, read_joints(hand)) as (line, bus):
-        bus._port.starved_s = starved_s
+        line.port.starved_s = starved_s
         line.faults.cut_off.add(11)
         ask = (lambda: bus.read(11, "drive_mode"), bus.read_state, bus.read_torque)
         for one in ask:
@@ -179,11 +179,11 @@ def test_the_answer_to_a_question_that_was_given_up_is_not_taken_for_the_next_on
     """A line that was 50 ms behind once and 20 from then on was a question late all the time."""
     hand = load_hand("dclaw3")
     given_up = []
-    with simulated_bus(hand, read_joints(hand)) as (_, bus):
+    with simulated_bus(hand, read_joints(hand)) as (line, bus):
         first = bus.read_state()
         for step in range(40):
             bus.clock.sleep(0.005)
-            bus._port.lag_s = (0.0, 0.05, 0.02)[(step >= 10) + (step > 10)]
+            line.port.lag_s = (0.0, 0.05, 0.02)[(step >= 10) + (step > 10)]
             try:
                 state = bus.read_state(retries=0)
             except BusError:
@@ -202,9 +202,9 @@ def test_the_second_answer_to_a_question_asked_twice_is_not_taken_for_the_next_o
         motor = line.motors[0]
         motor.put("position_p_gain", 321)
         motor.put("position_d_gain", 12)
-        bus._port.lag_s = 0.06  # the SDK waits for 34 ms
+        line.port.lag_s = 0.06  # the SDK waits for 34 ms
         first = bus.read(motor.id, "position_p_gain")
-        bus._port.lag_s = 0.0
+        line.port.lag_s = 0.0
         bus.clock.sleep(0.03)
         assert (first, bus.read(motor.id, "position_d_gain")) == (321, 12)
 

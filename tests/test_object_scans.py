@@ -74,7 +74,7 @@ def test_an_object_is_known_by_its_scan(device):
         assert np.median(away) < 0.003
     of = {"world_object": np.arange(2), "world_scale": np.ones(2), "library": library_on(device)}
     found = Registration(known, **of, camera=None, device=device)
-    assert (found._shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
+    assert (found.shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
     assert [len(turns) for turns in symmetries(known, device)] == [1] * 2, (
         "noise makes nothing symmetric"
     )

@@ -20,6 +20,7 @@ from vd.evaluate import cli as evaluate
 from vd.evaluate.spin import SPIN_FILE, turn
 from vd.logs.hand_log import read_log
 from vd.policy.agents import open_policy, task_for
+from vd.train import cli as train
 from vd.train.presets import PRESETS, smoke
 from vd.train.teacher import build_teacher
 
@@ -109,7 +110,7 @@ def test_turns_are_counted_to_the_drop_or_the_end(policy):
     np.testing.assert_allclose(angle[0, :2], [12 * 0.2, -12 * 0.1], atol=0.4)
 
 
-def test_it_is_judged_by_its_turns_and_not_beside_policies_with_goals(policy, tmp_path, capsys):
+def test_it_is_judged_by_its_turns_and_is_no_policy_with_goals(policy, tmp_path, capsys):
     flags = ["--objects", "cube", "--episodes", "2", "--episode-s", "0.5", "--device", "cpu"]
     assert evaluate.main([policy, "zero", *flags, "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / SPIN_FILE).read_text())
@@ -119,6 +120,8 @@ def test_it_is_judged_by_its_turns_and_not_beside_policies_with_goals(policy, tm
     for more, why in (([policy, "--consecutive"], "no goals"), ([policy, "dclaw3"], "to goals")):
         assert evaluate.main([*more, *flags, "--out", str(tmp_path)]) == 1
         assert why in capsys.readouterr().err
+    assert train.main(["tracker", policy, "--objects", "cube", "--device", "cpu"]) == 1
+    assert f"{policy} turns objects without a goal" in capsys.readouterr().err
 
 
 def test_revolutions_are_about_the_axis_however_often_it_goes_round():

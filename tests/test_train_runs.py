@@ -57,7 +57,7 @@ def test_three_and_three_more_equal_six(tmp_path, schedule):
 
 def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
     runner = make_runner(tmp_path, save_every=1)
-    runner._window = GoalWindow(2)
+    runner.window = GoalWindow(2)
     runner.learn(1)
     assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 1, (
         "before, it is the latest"
@@ -220,7 +220,7 @@ def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
 def test_the_best_is_the_tightest_before_the_most_successful(tmp_path):
     env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, save_every=1)
-    runner._window = GoalWindow(1)
+    runner.window = GoalWindow(1)
     scores = []
     for tightness in (0.0, 0.5, 0.25):
         env.levels = Levels(1.0, tightness)
@@ -244,7 +244,7 @@ def _outputs(runner, observation: torch.Tensor) -> list[torch.Tensor]:
 def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path):
     adaptive = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
     first = make_runner(tmp_path / "first", ppo=adaptive, save_every=1)
-    first._window = GoalWindow(1)
+    first.window = GoalWindow(1)
     first.learn(3)
     checkpoint = find_checkpoint(tmp_path / "first", "latest")
     assert load_checkpoint(checkpoint)["best"] is not None
@@ -257,7 +257,7 @@ def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path)
     one, two = _weights(first), _weights(second)
     assert all(torch.equal(one[name], two[name]) for name in one)
     assert not second.env.env.step_count.numpy().any()
-    assert second._best is None and not second._window.full, (
+    assert second._best is None and not second.window.full, (
         "another run's rates would decide which is best"
     )
     second.learn(1)

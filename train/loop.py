@@ -185,7 +185,7 @@ class TrainingLoop:
         except Interrupted:
             whole = False
         finally:
-            self._close()
+            self.close()
         self.shutdown()
         return whole
 
@@ -334,7 +334,7 @@ class TrainingLoop:
         if self.env is not None:
             self.env.env.load_state_dict(state["env"])
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Release the environments."""
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:

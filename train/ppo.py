@@ -148,12 +148,12 @@ class TeacherPPO(PPO):
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
-        self._take_samples()
+        self.take_samples()
         watched = self.actor_learns and self.schedule == "adaptive"
         divergence = 0.0
         steps = []
         for rows in self.minibatches():
-            steps.append(self._minibatch_step(rows))
+            steps.append(self.minibatch_step(rows))
             if watched and len(steps) % self.num_mini_batches == 0:
                 divergence = self._divergence(steps[-self.num_mini_batches :])
                 if divergence > RUNAWAY_KL * self.desired_kl:
@@ -182,7 +182,7 @@ class TeacherPPO(PPO):
         storage = self.storage
         return storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
 
-    def _take_samples(self) -> None:
+    def take_samples(self) -> None:
         """Copy the rollout into the memory that minibatches are gathered from."""
         storage = self.storage
         assert storage.distribution_params is not None, "there is no rollout"
@@ -212,7 +212,7 @@ class TeacherPPO(PPO):
             order = torch.randperm(samples, device=self.device)
             yield from order[: size * self.num_mini_batches].split(size)
 
-    def _minibatch_step(self, rows: torch.Tensor) -> torch.Tensor:
+    def minibatch_step(self, rows: torch.Tensor) -> torch.Tensor:
         """One optimiser step on these samples.
 
         Returns:

@@ -207,7 +207,7 @@ class AlignTrainer(SupervisedLoop):
     def _shared_state(self) -> dict[str, Any]:
         return super()._shared_state() | {"spec": to_dict(self.spec)}
 
-    def _close(self) -> None:
+    def close(self) -> None:
         if self.looks is not None:
             self.looks.close()
 

@@ -69,7 +69,7 @@ class SimulatedSequences:
         points = cfg.clouds.points
         goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
         self.goals = self._scale * goals
-        self._shapes = surfaces[:, points:]
+        self.shapes = surfaces[:, points:]
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
@@ -204,8 +204,8 @@ class SimulatedSequences:
     def _complete(self, pose: Tensor, rows: Tensor) -> Tensor:
         """Points all over the objects of environments ``rows`` at poses [R, 7], with noise [R, K, 3]."""
         clouds = self._cfg.clouds
-        order = torch.randperm(self._shapes.shape[1], device=pose.device)[: clouds.points]
-        shapes = self._scale[rows] * self._shapes[self._object[rows]][:, order]
+        order = torch.randperm(self.shapes.shape[1], device=pose.device)[: clouds.points]
+        shapes = self._scale[rows] * self.shapes[self._object[rows]][:, order]
         points = carried(shapes, quaternion_matrices(pose[:, 3:]), pose[:, None, :3])
         return points + clouds.noise_m * torch.randn_like(points)
 

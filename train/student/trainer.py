@@ -115,7 +115,7 @@ class StudentTrainer(SupervisedLoop):
             self.acting.hidden = state["hidden"]
             self.acting.lost = state["lost"]
 
-    def _close(self) -> None:
+    def close(self) -> None:
         self.source.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:

@@ -105,7 +105,7 @@ class PlayViewer:
         self.viewer.begin_frame(shot.time_s)
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
-        self._status.content = status_html(shot)
+        self.status.content = status_html(shot)
         if isinstance(self.session, Session) and self.session.sees:
             self._eye.image = self.session.view()
         self.viewer.end_frame()
@@ -141,7 +141,8 @@ class PlayViewer:
         gui = self.viewer.server.gui
         session = self.session
         with gui.add_folder("Policy", order=-1.0):
-            self._status = gui.add_html(status_html(session.snapshot))
+            self.status = gui.add_html(status_html(session.snapshot))
+            """What the page says of the moment."""
             if len(session.object_names) > 1:
                 self._build_menu(session)
             new_goal = gui.add_button("New goal")
