@@ -267,6 +267,7 @@ class Motor:
         return Failure.NONE
 
     def accept(self, name: str, value: int) -> None:
+        """Do what a value that may be written asks for."""
         if name == "torque_enable" and value and not self.get("torque_enable"):
             if self.get("operating_mode") == POSITION_MODE:
                 self._count_one_turn()

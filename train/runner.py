@@ -269,4 +269,5 @@ class TeacherRunner(TrainingLoop):
         self._stagger_due = bool(self.new_episodes)
 
     def close(self) -> None:
+        """Free the environments."""
         self.env.env.close()

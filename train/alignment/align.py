@@ -208,6 +208,7 @@ class AlignTrainer(SupervisedLoop):
         return super()._shared_state() | {"spec": to_dict(self.spec)}
 
     def close(self) -> None:
+        """Free the environments."""
         if self.looks is not None:
             self.looks.close()
 

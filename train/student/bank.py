@@ -51,6 +51,7 @@ class ShapeBank:
         self._meshes = centred_points(objects, max(MESH_POINTS, points), device)
         self._oldest = 0
         self.shapes = torch.empty((count, points, 6), dtype=torch.half, device=device)
+        """Points [m] and normals [count, P, 6]."""
         self.renew(count)
 
     def renew(self, count: int) -> None:

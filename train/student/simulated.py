@@ -70,6 +70,7 @@ class SimulatedSequences:
         goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
         self.goals = self._scale * goals
         self.shapes = surfaces[:, points:]
+        """Points of each object that a look is drawn of [K, P, 6]."""
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)

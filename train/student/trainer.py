@@ -116,6 +116,7 @@ class StudentTrainer(SupervisedLoop):
             self.acting.lost = state["lost"]
 
     def close(self) -> None:
+        """Free the environments."""
         self.source.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
