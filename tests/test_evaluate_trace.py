@@ -224,6 +224,12 @@ def test_up_to_symmetry_follows_the_stop_and_tolerance_by_object_too():
     assert row.per_object[0].symmetric.value == 1.0, "at the one step at which it looks like it"
     other = judge(traced(0.95), strict, [FakeObject("a")], agent, group="training")[0]
     assert other.per_object[0].symmetric.value == 0.0
+    early = traced(0.85, policy={"offset": -0.3})  # stops 0.45 rad before the goal
+    seeing = replace(agent, sees="complete clouds", rules=lambda _: StoppingRule(0.2))
+    for tolerance in (0.4, 0.5):
+        asked = replace(protocol(1), stop_tolerance_rad=tolerance)
+        row = judge(early, asked, [FakeObject("a")], seeing, group="training")[0]
+        assert row.per_object[0].symmetric.value == float(tolerance > 0.45)
 
 
 def test_what_was_stopped_is_held_and_looked_at_again():
