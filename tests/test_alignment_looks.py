@@ -96,9 +96,9 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     )
     init = ["--stage", "1", "--init", str(folders[0] / "alignment.pt"), "--looks.steps", "2"]
     assert main(["alignment", *common, *init, "--out", str(folders[1]), "--max-steps", "32"]) == 0
-    assert "begins with the weights of" in capsys.readouterr().out
+    assert "begins with" in capsys.readouterr().out
     assert main(["alignment", "--out", str(folders[1]), "--resume", "--max-steps", "48"]) == 0
-    assert "resumed after iteration 2 of 3" in capsys.readouterr().out
+    assert "resumed after iteration 2" in capsys.readouterr().out
     rows = read_progress(folders[1] / "progress.jsonl")
     assert [row["iteration"] for row in rows] == [1, 2, 3]
     assert all(0.0 <= row["looks/rotation_error"] <= 3.15 for row in rows)

@@ -320,7 +320,7 @@ def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
     with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
-        with pytest.raises(StoppedError, match=r"image is 3\.00 s from the future: wait .*plug"):
+        with pytest.raises(StoppedError, match=r"3\.00 s from the future: .*plug"):
             safe.image_at(bus.clock.now() + 3.0)
 
 
@@ -425,7 +425,7 @@ def test_all_threads_run_before_other_programs_and_not_after():
 
 
 def test_settings_that_switch_a_limit_off_are_refused(bus, hand, joints):
-    with pytest.raises(ValueError, match=r"safety\.step_rad is 0"):
+    with pytest.raises(ValueError, match=r"step_rad is 0"):
         SafetyCfg(step_rad=0.0)
-    with pytest.raises(ValueError, match=r"safety\.margin_rad is 2"):
+    with pytest.raises(ValueError, match=r"margin_rad is 2"):
         SafeHand(bus, joints, SafetyCfg(margin_rad=2.0))

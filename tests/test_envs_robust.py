@@ -168,12 +168,10 @@ def test_a_tracker_that_drops_every_pose_shows_the_start_and_has_ages_of_its_own
     assert not np.ptp(seen[..., parts["object_position"]], axis=0).any()
     assert not seen[..., parts["object_velocity"]].any()
     both = dataclasses.replace(tracked(), observation_latency_s=(0.0, 0.1))
-    with pytest.raises(
-        ValueError, match=r"tracked_pose has ages of its own: leave observation_lat"
-    ):
+    with pytest.raises(ValueError, match=r"tracked_pose .*leave observation_lat"):
         make(randomisation=both)
     slow = TrackedPoseCfg(rate_hz=(0.5, 30.0))
-    with pytest.raises(ValueError, match=r"tracked_pose.rate_hz is 0.5 30; it has to rise from 2"):
+    with pytest.raises(ValueError, match=r"rate_hz is 0.5 30; .*2"):
         make(randomisation=dataclasses.replace(EXACT, tracked_pose=slow))
 
 

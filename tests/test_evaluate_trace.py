@@ -297,7 +297,7 @@ def test_every_start_and_goal_is_run_once_whatever_the_number_of_environments(en
     np.testing.assert_allclose([e.exact_error_rad for e in episodes], plain, atol=1e-5)
     assert max(errors[4:8]) < 1.1 < plain[4:8].max(), "of a cube up to symmetry"
     env.world_object[:] = 0
-    with pytest.raises(ValueError, match="no environment simulates object 1"):
+    with pytest.raises(ValueError, match="simulates object 1"):
         record(env, Turner(env), 4, **told)
 
 
@@ -393,7 +393,7 @@ def test_a_result_is_read_as_it_was_written_and_compares_policies_in_pairs(tmp_p
     result.write(tmp_path / "eval.json")
     assert Result.read(tmp_path / "eval.json") == result
     (tmp_path / "x.json").write_text('{"format": 1}')
-    with pytest.raises(ValueError, match="run vd-eval again"):
+    with pytest.raises(ValueError, match="vd-eval again"):
         Result.read(tmp_path / "x.json")
     row = result.rows[1]  # succeeds in all episodes
     lost = tuple(replace(e, stopped=e.object_index == 0) for e in row.episodes)

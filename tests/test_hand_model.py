@@ -86,7 +86,7 @@ def test_kinematics_of_a_batch(hand: HandModel) -> None:
     poses = hand.forward_kinematics(q)
     assert poses.shape == (2, 3, len(hand.link_names), 7)
     np.testing.assert_allclose(poses[1, 2], hand.forward_kinematics(q[1, 2]), atol=1e-12)
-    with pytest.raises(ValueError, match="last axis must be"):
+    with pytest.raises(ValueError, match="last axis"):
         hand.forward_kinematics(np.zeros(hand.num_joints + 1))
 
 
@@ -337,11 +337,11 @@ def test_without_a_camera_one_looks_at_where_objects_are_handled(
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path, four_fingers: HandModel) -> None:
-    with pytest.raises(HandError, match=r"no such file; name a hand"):
+    with pytest.raises(HandError, match=r"name a hand"):
         read_hand(tmp_path / "absent.usda")
     garbage = tmp_path / "garbage.usda"
     garbage.write_text("solid not usd\n")
-    with pytest.raises(HandError, match=r"garbage\.usda: not a USD file"):
+    with pytest.raises(HandError, match=r"garbage\.usda: not"):
         read_hand(garbage)
     with pytest.raises(HandError, match=r"'velvet'.*rigid, soft"):
         read_hand(four_fingers.path, fingertip="velvet")

