@@ -271,9 +271,8 @@ class Motor:
         if name == "torque_enable" and value and not self.get("torque_enable"):
             if self.get("operating_mode") == POSITION_MODE:
                 self._count_one_turn()
-            self.put(
-                "goal_position", self.get("present_position")
-            )  # a motor does not jump when switched on
+            # A motor does not jump when switched on.
+            self.put("goal_position", self.get("present_position"))
         if name == "operating_mode" and value != self.get(name):
             for item in MODE_ITEMS:
                 self.put(item, self.items[item].initial)

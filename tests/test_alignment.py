@@ -162,9 +162,8 @@ def test_a_reset_begins_anew(near_sighted):
     goal, seen = clouds(torch.arange(2.0))
     aligner = Aligner(network, goal)
     aligner.look(seen)
-    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(
-        np.float32
-    )  # it was wrong
+    # It was wrong.
+    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(np.float32)
     aligner.reset(torch.tensor([True, False]))
     first = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert first[0] < 0.2 and first[1] > 0.5

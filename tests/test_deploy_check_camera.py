@@ -86,9 +86,8 @@ def test_depth_counts_where_the_object_is_handled():
     depth[int(row) - 40 : int(row) + 40, int(column) - 40 : int(column) + 40] = 0.0
     found = look(Camera(depth=depth))
     assert wrong(found) == ["depth"] and "0 % of the pixels" in found["depth"][1]
-    assert "depth" in wrong(
-        look(Camera(depth=np.full((180, 320), 9.0, dtype=np.float32)))
-    )  # out of range
+    # Out of range.
+    assert "depth" in wrong(look(Camera(depth=np.full((180, 320), 9.0, dtype=np.float32))))
     rng = np.random.default_rng(0)
     for noise_m, blind in ((0.002, []), (0.03, ["depth"])):
         noisy = rng.normal(0.6, noise_m, (180, 320)).astype(np.float32)

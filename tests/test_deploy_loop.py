@@ -425,12 +425,10 @@ def test_latency_is_told_as_training_draws_it(parts):
     loop.run([GOAL])
     log.finish("done")
     found = summary(loop.times)
-    assert found["observation_latency_ms"]["median"] == pytest.approx(
-        40.0
-    )  # the image, when joints are read
-    assert found["command_delay_ms"]["median"] == pytest.approx(
-        20.0
-    )  # from then until goals are sent
+    # The image, when joints are read.
+    assert found["observation_latency_ms"]["median"] == pytest.approx(40.0)
+    # From then until goals are sent.
+    assert found["command_delay_ms"]["median"] == pytest.approx(20.0)
     np.testing.assert_allclose(read_log(log.folder).columns["image_s"], 0.005 - 0.04, atol=1e-6)
     blind = summary([replace(loop.times[0], image_s=np.nan)])
     assert "observation_latency_ms" not in blind and "command_delay_ms" in blind
@@ -466,11 +464,12 @@ def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
         "--log",
         str(folder),
     ]
+    # The second 2 rad away, so that it takes a while.
     goals = [
         "--goal",
         "0,0,0,1",
         "0,0,0.84147,0.5403",
-    ]  # the second 2 rad away, so that it takes a while
+    ]
     status, out, words = driven([*flags, *patient, *goals], capsys)
     assert status == 0, words
     log = read_log(folder)

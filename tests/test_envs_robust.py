@@ -29,9 +29,8 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
     What was observed, before the first step too, and what was true.
     """
     quats = Rotation.random(WORLDS, rng=np.random.default_rng(1)).as_quat()
-    env.state.rng.assign(
-        np.arange(WORLDS, dtype=np.uint32)
-    )  # building one drew a latency, another did not
+    # Building one drew a latency, another did not.
+    env.state.rng.assign(np.arange(WORLDS, dtype=np.uint32))
     env.reset(object_quat=quats, goal_quat=quats[::-1])
     rng = np.random.default_rng(seed)
     seen, rewards, states = [env.observation.numpy().copy()], [], [env.sim.joint_q.numpy().copy()]

@@ -108,9 +108,8 @@ def test_surface_samples_lie_on_the_drawn_surface_and_cover_it(hand: HandModel) 
         motor = name.endswith("motor")
         assert hand.link_names[link] == ("base" if motor else name)
         mesh = drawn(hand, "base" if motor else name, name if motor else "")
-        corners = 1e3 * np.tile(
-            mesh.triangles, (len(points), 1, 1)
-        )  # mm: trimesh's tolerances are absolute
+        # In mm: trimesh's tolerances are absolute.
+        corners = 1e3 * np.tile(mesh.triangles, (len(points), 1, 1))
         targets = 1e3 * np.repeat(points, len(mesh.faces), axis=0).astype(float)
         distance = np.linalg.norm(
             trimesh.triangles.closest_point(corners, targets) - targets, axis=1

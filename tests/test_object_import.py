@@ -202,17 +202,19 @@ def _runs(pid: int) -> bool:
         ((120.0, 80.0, 50.0), (0.12, 0.08, 0.05), "taken as mm"),
         ((2.0, 1.0, 1.0), (0.095, 0.0475, 0.0475), "taken as cm, scaled"),
         ((0.16, 0.12, 0.04), (0.13, 0.0975, 0.0325), "scaled by 0.812"),  # too wide for the fingers
+        # That is as far as its length goes.
         (
             (0.12, 0.12, 0.12),
             (0.095, 0.095, 0.095),
             "scaled by 0.792",
-        ),  # which is as far as its length goes
+        ),
         ((0.1, 0.03, 0.02), (0.125, 0.0375, 0.025), "scaled by 1.25"),  # too thin to be got hold of
+        # Which is as far as its length goes.
         (
             (0.15, 0.03, 0.02),
             (0.165, 0.033, 0.022),
             "scaled by 1.1",
-        ),  # which is as far as its length goes
+        ),
         ((0.12, 0.1, 0.02), (0.13, 0.13 / 1.2, 0.13 / 6.0), "scaled by 1.08"),  # or its width
     ],
 )

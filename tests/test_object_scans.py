@@ -91,9 +91,8 @@ def test_a_scan_is_noisy_and_misses_one_side():
     assert first.max() < 0.3 * RADIUS_M, (
         "in no order: a network takes the first points for the whole"
     )
-    off = (
-        np.linalg.norm(scanned, axis=1) - RADIUS_M
-    )  # across the surface only one axis of the noise shows
+    # Across the surface only one axis of the noise shows.
+    off = np.linalg.norm(scanned, axis=1) - RADIUS_M
     assert off.std() == pytest.approx(NOISE_M, rel=0.1)
     side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))
     # A cap with a fifth of a sphere's area begins at 0.6 of its radius.

@@ -98,9 +98,8 @@ def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeyp
 def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, capsys, how, resume):
     simulating_the_dummy(monkeypatch)
     run = ["--out", str(tmp_path)]
-    assert (
-        teacher("--smoke", *run, "--max-steps", "384") == 0
-    )  # 128 an iteration, a checkpoint each
+    # 128 an iteration, a checkpoint each.
+    assert teacher("--smoke", *run, "--max-steps", "384") == 0
     newest = checkpoint_path(tmp_path, 3)
     spoil(newest, how)
     assert teacher(*run, *resume, "--max-steps", "512") == 0

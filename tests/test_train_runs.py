@@ -111,9 +111,8 @@ def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
 
 
 def test_limits_of_steps_and_time(tmp_path):
-    runner = make_runner(
-        tmp_path / "steps", max_steps=300
-    )  # 16 environments x 8 steps = 128 an iteration
+    # 16 environments x 8 steps = 128 an iteration.
+    runner = make_runner(tmp_path / "steps", max_steps=300)
     runner.learn()
     assert runner.iteration == 3 and runner.env_steps == 384
     timed = make_runner(tmp_path / "time", max_minutes=1e-6, save_every=100)

@@ -158,9 +158,8 @@ def _export(
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
-            tuple(
-                value[:2] for value in inputs.values()
-            ),  # of one it would take the number for fixed
+            # Of one it would take the number for fixed.
+            tuple(value[:2] for value in inputs.values()),
             temporary,
             input_names=list(inputs),
             output_names=outputs,

@@ -298,9 +298,7 @@ class TrainingLoop:
         """Why processes and environments of a checkpoint cannot be restored; empty if they can."""
         if len(ranks) != self.world_size:
             return f"the checkpoint is of {len(ranks)} processes, this run has {self.world_size}"
-        if self.env is None or (saved := {saved_worlds(rank) for rank in ranks}) == {
-            self.env.num_envs
-        }:
+        if self.env is None or (saved := set(map(saved_worlds, ranks))) == {self.env.num_envs}:
             return ""
         if saved == {0}:
             return "the checkpoint holds no environments"

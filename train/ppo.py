@@ -64,9 +64,8 @@ class TeacherPPO(PPO):
     Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it
     as terminal. The value belongs to the stored observation *before* the step, because the
     observation returned after it is already the new episode's. That stands in for ``V(s_{t+1})`` of
-    the state that was
-    cut off, one control step later: a small error in one step of an episode, and no bias towards
-    zero.
+    the state that was cut off, one control step later: a small error in one step of an episode, and
+    no bias towards zero.
 
     Attributes:
         actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
@@ -262,9 +261,8 @@ class TeacherPPO(PPO):
             loss = loss + self.bound_coef * excess.square().sum(dim=-1).mean()
 
         loss.backward()
-        self.actor.distribution._distribution = (
-            None  # or this pass would outlive itself, and a recording
-        )
+        # Or this pass would outlive itself, and a recording.
+        self.actor.distribution._distribution = None
         with torch.no_grad():
             clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
             beyond = (excess > 0.0).float().mean()

@@ -101,9 +101,8 @@ def _limited(parent: int, seconds: float) -> None:
     limit = int(time.process_time()) + max(1, round(seconds))
     resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.environ["OMP_WAIT_POLICY"] = (
-        "passive"  # threads that wait for each other take no processor time
-    )
+    # Threads that wait for each other take no processor time.
+    os.environ["OMP_WAIT_POLICY"] = "passive"
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 

@@ -203,7 +203,7 @@ class MotorBus:
         """IDs of all motors that answer a ping to all."""
         with self._line():
             motors, _ = self._packets.broadcastPing(self._port)
-        return [int(id) for id in motors]
+        return list(map(int, motors))
 
     def missing(self) -> dict[int, str]:
         """What is wrong with the motors that do not answer, or are of another model, by ID."""

@@ -188,7 +188,7 @@ def _holding(bus: MotorBus) -> str:
     on = bus.read_torque()
     if not on.any():
         return ""
-    ids = ", ".join(str(id) for id in np.array(bus.ids)[on])
+    ids = ", ".join(map(str, np.array(bus.ids)[on]))
     current = float(np.abs(bus.read_state().current[on]).max())
     return (
         f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are "

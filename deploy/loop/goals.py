@@ -122,7 +122,7 @@ def make_goals(texts: Sequence[str]) -> list[np.ndarray]:
     Raises:
         GoalError: One is none.
     """
-    return [_goal(text) for text in texts]
+    return list(map(_goal, texts))
 
 
 def drawn_goals(symmetry: np.ndarray, count: int, *, seed: int = 0) -> list[np.ndarray]:
@@ -148,7 +148,7 @@ def drawn_goals(symmetry: np.ndarray, count: int, *, seed: int = 0) -> list[np.n
 def _goal(text: str) -> np.ndarray:
     turn, _, degrees = text.partition("@")
     try:
-        numbers = np.array([float(part) for part in turn.split(",")])
+        numbers = np.array(list(map(float, turn.split(","))))
         angle = np.radians(float(degrees)) if "@" in text else 0.0
     except ValueError:
         numbers = np.zeros(0)

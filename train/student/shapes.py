@@ -179,7 +179,7 @@ def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
         place: Number of the body in its shape, 0 for the first.
         device: Torch device.
     """
-    low, high = (math.log(value) for value in HALF_AXES)
+    low, high = map(math.log, HALF_AXES)
     half = uniform(low, high, count, 3, device=device).exp() * (1.0 if place else FIRST_GROWN)
     exponents = uniform(*ROUND_EXPONENTS, count, 2, device=device)
     boxes = torch.rand((count, 2), device=device) < 0.5

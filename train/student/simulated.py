@@ -1,9 +1,9 @@
 """Stages 1 and 2: the student acts in simulation, and the teacher says what it would have done (DAgger).
 
 Where an episode begins the student is told about where the object is, and follows it from there. In
-stage 1 it is told complete surfaces where the objects truly are, and nothing is
-rendered; in stage 2 what a depth camera sees. Rollouts hold what clouds are made of rather than
-clouds (0.4 kB a step; with a camera also its points). T steps, N environments, D joints, K points.
+stage 1 it is told complete surfaces where the objects truly are, and nothing is rendered; in stage
+2 what a depth camera sees. Rollouts hold what clouds are made of rather than clouds (0.4 kB a step;
+with a camera also its points). T steps, N environments, D joints, K points.
 """
 
 import math

@@ -100,7 +100,7 @@ def compare(
             actor, agent = planning(actor, agent, env, cfg.seed)
         trace = run_episodes(cfg, env, actor, agent)
         for group, sets in groups.items():
-            chosen = [files.index(file) for file in set_files(sets)]
+            chosen = list(map(files.index, set_files(sets)))
             objects = [env.objects[number] for number in chosen]
             protocol = _protocol(cfg, task, sets, agent.sees)
             rows += judge(

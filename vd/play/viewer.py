@@ -83,9 +83,8 @@ class PlayViewer:
         due = time.monotonic()
         while self.viewer.is_running() and (steps is None or done < steps):
             done += self.update()
-            due = max(
-                due + period, time.monotonic() - period
-            )  # after a pause, do not hurry to catch up
+            # After a pause, do not hurry to catch up.
+            due = max(due + period, time.monotonic() - period)
             time.sleep(max(0.0, due - time.monotonic()))
 
     def update(self) -> bool:
