@@ -66,9 +66,8 @@ def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(
         ages[parts[name]] = hand_late
     for name in ("goal_orientation", "previous_action"):  # known, not measured
         ages[parts[name]] = 0
-    if (
-        object_late != hand_late
-    ):  # a late object and other fingertips: what lies between them is of no state
+    # A late object and other fingertips: what lies between them is of no state.
+    if object_late != hand_late:
         ages[parts["previous_action"].stop :][:9] = -1
     for step in range(8):
         for age in set(ages) - {-1}:

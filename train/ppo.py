@@ -276,9 +276,8 @@ class TeacherPPO(PPO):
         normaliser = network.obs_normalizer
         std = getattr(normaliser, "_std", None)
         network.update_normalization(self.storage.observations.flatten(0, 1))
-        if (
-            std is not None
-        ):  # rsl-rl makes a new tensor of it, which a recorded graph would not read
+        # rsl-rl makes a new tensor of it, which a recorded graph would not read.
+        if std is not None:
             std.copy_(normaliser._std)
             normaliser._std = std
 

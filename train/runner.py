@@ -144,9 +144,8 @@ class TeacherRunner(TrainingLoop):
         return self.ppo.rollout_steps * self.env.num_envs
 
     def _begin(self) -> None:
-        if (
-            self._stagger_due
-        ):  # new environments begin within their episode, or all would time out at once
+        # New environments begin within their episode, or all would time out at once.
+        if self._stagger_due:
             steps = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(
                 steps, high=int(self.env.max_episode_length)

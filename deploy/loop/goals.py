@@ -200,8 +200,7 @@ def _unit(path: Path, longest: float) -> float:
     if not fitting:
         raise GoalError(
             f"{path}: its longest side is {longest:.4g} units, which in "
-            f"{' or '.join(GUESSED_UNITS)} is not "
-            f"within {100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or "
-            "scale the file to metres"
+            f"{' or '.join(GUESSED_UNITS)} is not within {100 * low:.0f} to {100 * high:.0f} cm; "
+            "cut away what is not the object, or scale the file to metres"
         )
     return fitting[0]

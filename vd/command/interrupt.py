@@ -148,9 +148,8 @@ def handled(
 ) -> Iterator[None]:
     """Have signals call ``handler``, but for a SIGHUP that is ignored (nohup)."""
     before = {}
-    if (
-        threading.current_thread() is threading.main_thread()
-    ):  # signals belong to it; elsewhere are none
+    # Signals belong to it; elsewhere are none.
+    if threading.current_thread() is threading.main_thread():
         for number in numbers:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 before[number] = signal.signal(number, handler)
