@@ -245,6 +245,15 @@ def test_each_joint_wiggles_in_turn_as_it_is_told_and_only_after_a_yes(
     assert out.count("ok     wiggle of") == 8
 
 
+def test_nothing_wiggles_and_nobody_is_asked_while_something_is_wrong(line, monkeypatch, capsys):
+    monkeypatch.setattr(check, "CYCLES", 1)
+    low(line)
+    line.clock.sleep(0.05)
+    assert check.check(check.CheckCfg(port=PORT, wiggle=True, no_camera=True)) == 1
+    assert "WRONG" in capsys.readouterr().out
+    assert not any(motor.get("torque_enable") for motor in line.motors)
+
+
 @pytest.fixture
 def plan(tmp_path, hand):
     """A plan of two short motions, one with a torque release and a lower gain."""
