@@ -105,7 +105,7 @@ def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, caps
     ):
         assert command([policy, "--hand", "dclaw3", "--device", "cpu", *flags]) == 1
         error = capsys.readouterr().err
-        assert f"{policy}dclaw4 (12 motors), not for dclaw3 (9)" in error
+        assert f"{policy} was trained for dclaw4 (12 motors), not for dclaw3 (9)" in error
     other = tmp_path / "other.usda"
     other.write_text(hand_usd("dclaw4").read_text().replace("dclaw4", "other"))
     assert main([policy, "--hand", str(other), "--device", "cpu", "--out", str(tmp_path)]) == 1

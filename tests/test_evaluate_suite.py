@@ -202,7 +202,7 @@ def test_the_papers_figures_stand_beside_ours(tmp_path, asked):
     figures = {(row["figure"], row["condition"]): row for row in written["figures"]}
     ours = figures["stopped within 0.4 rad by prediction", "air"]
     assert ours[TEACHER] == "–" and ours[CAMERA].startswith("0.0 %"), "the double stops at 0.65 rad"  # noqa: RUF001
-    assert figures["0.4 rad up to symmetry", "air"][CAMERA] == "100.0 %"
+    assert figures["states within 0.4 rad up to symmetry seen so", "air"][CAMERA] == "100.0 %"
     text, _ = read_page(tmp_path / "out" / "paper.html")
     assert "72.3 %" in text and "Held-out objects" in text and "our own" not in text
 

@@ -25,7 +25,7 @@ def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monke
         assert parse_teacher(["--preset", name]) == preset
     else:
         with pytest.raises(
-            ValueError, match=f"no hand{preset.env.hand}'.*--describe {preset.env.hand}"
+            ValueError, match=f"'{preset.env.hand}'.*--describe {preset.env.hand}"
         ):
             parse_teacher(["--preset", name])
         flags = ["--preset", name, "--hand", "dclaw3"]

@@ -244,7 +244,7 @@ def test_a_folder_is_one_trainings_and_that_of_a_dead_one_is_free(tmp_path, type
         assert other.stdout.readline() == "has it\n"
         for command in ("teacher --smoke", "student --smoke", "alignment --smoke"):
             status, said = typed(f"vd-train {command} --out {folder}")
-            assert status == 1 and f"in use by{other.pid} on" in said
+            assert status == 1 and f"process {other.pid} on" in said
     finally:
         other.kill()
         other.wait()
