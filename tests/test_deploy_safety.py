@@ -264,6 +264,17 @@ def test_on_a_lost_bus_what_presses_on_an_obstacle_is_let_go(bus, line, hand, jo
         assert push(line).max() < 0.002
 
 
+def test_where_the_adapter_is_gone_every_motor_is_named(bus, line, joints):
+    def gone(_):
+        raise OSError("no adapter")
+
+    with SafeHand(bus, joints, QUICK) as safe:
+        safe.arm()
+        line.port.writePort = gone
+        assert "no adapter" in run_until_stopped(safe, START)
+    assert sorted(safe.report.unreleased) == sorted(bus.ids)
+
+
 def test_a_blocked_joint_is_let_go(bus, line, hand, joints):
     with SafeHand(bus, joints, replace(QUICK, step_rad=4.0, current_s=0.3)) as safe:
         here = safe.arm().position
