@@ -249,11 +249,10 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     rows = tuple(row for compared in results for row in compared.rows if row.stopped_by != SUCCESS)
     result = Result(rows, results[0].software)
     page = cfg.out / PAGE
-    rate = {
-        (model, policy): percent(row.overall.outcomes["success"])
-        for (model, _), headlines in result.headlines().items()
-        for policy, row in headlines.items()
-    }
+    rate = {}
+    for (model, _), headlines in result.headlines().items():
+        for policy, row in headlines.items():
+            rate[model, policy] = percent(row.overall.outcomes["success"])
     layer = shown_name(str(cfg.hand_layer))
     summary = (
         f"{before} succeeds in {rate[NOMINAL, before]} of the episodes in the nominal model of "

@@ -100,8 +100,8 @@ def prune_checkpoints(run_dir: Path, newest: int) -> None:
 
     What a run that went on from an older checkpoint finds after that stays.
     """
-    numbered = [(int(path.stem.removeprefix("model_")), path) for path in list_checkpoints(run_dir)]
-    for _, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
+    last = checkpoint_path(run_dir, newest)
+    for path in [path for path in list_checkpoints(run_dir) if path <= last][:-KEEP_LAST]:
         path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
         path.unlink(missing_ok=True)

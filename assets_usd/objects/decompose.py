@@ -151,9 +151,10 @@ def decompose(
         max_vertices: Most vertices of a part.
     """
     parts = _parts_or_reason(settings.time_limit, surface, settings, max_vertices)
-    hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
-    why = parts if isinstance(parts, str) else "it gave only slivers"
-    if hulls:
+    why = "it gave only slivers"
+    if isinstance(parts, str):
+        why = parts
+    elif hulls := tidy_hulls(parts, max_vertices):
         return Decomposition(hulls, "coacd")
     hull = simplify_hull(convex_hull(surface.vertices), max_vertices)
     return Decomposition(
