@@ -359,7 +359,7 @@ def _checked(where: str, name: str, parameter: Parameter, value: object) -> floa
 def _interval(where: str, name: str, parameter: Parameter, value: object) -> tuple[float, float]:
     """Low and high end of a 95 % interval."""
     try:
-        low, high = map(float, value)  # type: ignore[attr-defined]
+        low, high = (float(v) for v in value)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
         raise HandError(
             f"{where}: '{name}' is {value!r}; it must be two numbers, low and high"
