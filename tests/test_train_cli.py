@@ -24,9 +24,7 @@ def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monke
     if preset.env.hand in HANDS:
         assert parse_teacher(["--preset", name]) == preset
     else:
-        with pytest.raises(
-            ValueError, match=f"'{preset.env.hand}'.*--describe {preset.env.hand}"
-        ):
+        with pytest.raises(ValueError, match=f"'{preset.env.hand}'.*--describe {preset.env.hand}"):
             parse_teacher(["--preset", name])
         flags = ["--preset", name, "--hand", "dclaw3"]
         assert parse_teacher(flags).env == dataclasses.replace(preset.env, hand="dclaw3")
