@@ -44,7 +44,7 @@ env: $(STAMP)
 # torch comes first: where no GPU is found, its size is worth a word before the download starts.
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { \
-	  echo 'No Python 3.11, 3.12 or 3.13 found. Install one (Debian, Ubuntu: apt install python3.11 python3.11-venv;' >&2; \
+	  echo 'No Python 3.11, 3.12 or 3.13 found (3.14 lacks newton-usd-schemas). Install one (Debian, Ubuntu: apt install python3.11 python3.11-venv;' >&2; \
 	  echo 'elsewhere: pyenv install 3.11) or name it: make PYTHON=/path/to/python3.11' >&2; exit 1; }
 	@test -n "$(TORCH_INDEX)" || command -v nvidia-smi >/dev/null || \
 	  echo 'No GPU found. If pip chooses the CUDA build of torch below (gigabytes), stop it and set TORCH_INDEX, see docs/install.md.'

@@ -207,9 +207,9 @@ class _Reader:
             links += [f"f{finger}_l{i + 1}" for i in range(count)]
             joints += [self.prim(f"f{finger}_j{i + 1}") for i in range(count)]
             tips.append(self.prim(f"{links[-1]}/f{finger}_tip"))
-        bodies = [self.prim(name) for name in links]
+        bodies = list(map(self.prim, links))
         index = {body.GetPath(): i for i, body in enumerate(bodies)}
-        columns = _columns([self._link(body) for body in bodies])
+        columns = _columns(list(map(self._link, bodies)))
         columns |= _columns([self._joint(joint, joints, index) for joint in joints])
         self._check_mimic(joints, columns["mimic"])
         drive = {name: columns[name] for name in ("kp", "kd", "velocity_limit")}
@@ -415,7 +415,7 @@ class _Reader:
             return -1, 1.0, 0.0
         paths = [other.GetPath() for other in joints]
         if len(targets) != 1 or targets[0] not in paths:
-            what = f"'newton:mimicJoint' is {[str(target) for target in targets]}"
+            what = f"'newton:mimicJoint' is {list(map(str, targets))}"
             raise self.fail(joint, what, "point it at one joint of the hand")
         factor = self.number(joint, "newton:mimicCoef1")
         offset = math.radians(self.number(joint, "newton:mimicCoef0"))
@@ -460,7 +460,7 @@ class _Reader:
         if not prim.IsA(UsdGeom.Camera):
             kind = prim.GetTypeName() or "typeless prim"
             raise self.fail(prim, f"is a {kind}", "make it a Camera")
-        width, height = (int(pixels) for pixels in self.value(prim, "vd:resolution"))
+        width, height = map(int, self.value(prim, "vd:resolution"))
         if min(width, height) < 1:
             what = f"'vd:resolution' is {width} x {height}"
             raise self.fail(prim, what, "give the image size in pixels")

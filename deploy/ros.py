@@ -6,10 +6,9 @@ The node ``visual_dexterity`` reads JointState on ``joint_states`` and, for a po
 depth of 16UC1 or 32FC1 on ``depth/image_rect_raw``, with ``depth/camera_info``. On ``commands`` it
 sends Float64MultiArray, an angle [rad] for each joint in the order of the hand's USD, as
 ros2_control's forward_position_controller takes it. A value of its parameter ``goal``, a quaternion
-xyzw, is a further
-goal: ``ros2 param set`` calls the service ``set_parameters``, which says why it refuses one. The
-service ``~/finish`` (Trigger) ends the run after the last goal. ``~/events`` (String) tells of
-goals and stops. Topics get other names by remapping.
+xyzw, is a further goal: ``ros2 param set`` calls the service ``set_parameters``, which says why it
+refuses one. The service ``~/finish`` (Trigger) ends the run after the last goal. ``~/events``
+(String) tells of goals and stops. Topics get other names by remapping.
 
 Motors stay in the care of the driver: their torque, temperature and current are not looked at.
 """
@@ -185,7 +184,7 @@ class RosHand(FaultlessMotors):
 
     def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
         """Send an angle for each joint [rad]."""
-        self._commands.publish(self._message(data=[float(goal) for goal in goals]))
+        self._commands.publish(self._message(data=list(map(float, goals))))
 
     def freeze(self) -> None:
         """Have joints stay where they were last."""
@@ -291,9 +290,8 @@ def running_node(arguments: str = "") -> Iterator[Any]:
     from rclpy.signals import SignalHandlerOptions
 
     words = ["--ros-args", *shlex.split(arguments)]
-    rclpy.init(
-        args=words, signal_handler_options=SignalHandlerOptions.NO
-    )  # a signal stops the hand first
+    # A signal stops the hand first.
+    rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(NODE)
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -18,9 +18,8 @@ def undisturbed(before_all: bool) -> Iterator[bool]:
     """Run without the garbage collector and long turns of other threads, before other programs.
 
     The collector pauses for a second where there is much; a run makes little. A thread that waits
-    for the
-    interpreter, as after every packet, waits for whoever has it: 5 ms by default. Before all
-    ordinary programs run all threads, those that begin later too, where the system permits it
+    for the interpreter, as after every packet, waits for whoever has it: 5 ms by default. Before
+    all ordinary programs run all threads, those that begin later too, where the system permits it
     (root, ``ulimit -r 1``): the watchdog must not wait for other programs. The loop mostly sleeps.
 
     Args:

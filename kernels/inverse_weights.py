@@ -16,16 +16,13 @@ LEAST_LEVER_M = 1e-5
 @wp.kernel
 def inverse_weights_kernel(
     # In/Out:
-    weight: wp.array2d[
-        wp.vec2
-    ],  # [N, B] of translation [1/kg] and rotation [1/(kg m2)], in the zero pose
+    weight: wp.array2d[wp.vec2],  # [N, B] of translation [1/kg] and rotation [1/(kg m2)], pose zero
 ):
     """Give bodies that only turn about their centre of mass the weight of rotation. Launch: [N, B].
 
     The solver does so where that of translation is 0. Of a link whose centre of mass lies on its
-    axes it is
-    1e-15, with luck less: with more a contact with the palm is 1e15 times too stiff, and ends in
-    NaN.
+    axes it is 1e-15, with luck less: with more a contact with the palm is 1e15 times too stiff, and
+    ends in NaN.
     """
     world, body = wp.tid()
     both = weight[world, body]

@@ -8,9 +8,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
-if (
-    "PYTEST_XDIST_WORKER" in os.environ
-):  # before anything reads it: of shared cores each gets one thread
+# Before anything reads it: of shared cores each gets one thread.
+if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np

@@ -75,7 +75,7 @@ class MotorLine:
         self.plant = plant or FirstOrderPlant(len(self.motors))
         self.faults = faults or Faults()
         self.put = put
-        self._clock, self._then = clock, clock.now()
+        self.clock, self._then = clock, clock.now()
         self._random = random.Random(self.faults.seed)
         self._reader = PacketReader()
         self._held: list[tuple[float, bytes]] = []
@@ -89,7 +89,7 @@ class MotorLine:
 
     def go_on(self, heard: bytes = b"", *, at: float | None = None) -> None:
         """Go on to the present, or the moment ``at`` [s], in which bytes arrive at the motors, or none."""
-        now = max(self._clock.now() if at is None else at, self._then)
+        now = max(self.clock.now() if at is None else at, self._then)
         seconds, self._then = now - self._then, now
         if seconds > 0.0:
             self.plant.advance(seconds, [motor.drive() for motor in self.motors])
@@ -101,7 +101,7 @@ class MotorLine:
             packets = self._reader.give_up()
         for packet in packets:
             self._handle(packet)
-        for at, data in [held for held in self._held if held[0] <= self._clock.now()]:
+        for at, data in [held for held in self._held if held[0] <= self.clock.now()]:
             self._held.remove((at, data))
             self.put(data)
 
@@ -120,7 +120,7 @@ class MotorLine:
                 answers.setdefault(motor.id, []).append(encode(answer))
         for id, at_once in answers.items():
             delay = next(motor for motor in self.motors if motor.id == id).get("return_delay_time")
-            self._clock.sleep(delay * RETURN_DELAY_UNIT_S)
+            self.clock.sleep(delay * RETURN_DELAY_UNIT_S)
             self._send(collide(at_once))
 
     def _send(self, frame: bytes) -> None:
@@ -132,7 +132,7 @@ class MotorLine:
         if draw() < faults.truncate:
             del data[self._random.randrange(1, len(data)) :]
         if draw() < faults.late:
-            self._held.append((self._clock.now() + faults.late_s, bytes(data)))
+            self._held.append((self.clock.now() + faults.late_s, bytes(data)))
             return
         self.put(bytes(data))
 

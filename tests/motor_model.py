@@ -238,7 +238,7 @@ class Motor:
             changes.append((name, value))
             address, data = address + item.size, data[item.size :]
         for name, value in changes:
-            self._accept(name, value)
+            self.accept(name, value)
         return Failure.NONE
 
     def _refusal(self, name: str, value: int) -> Failure:
@@ -266,13 +266,13 @@ class Motor:
             return Failure.LIMIT
         return Failure.NONE
 
-    def _accept(self, name: str, value: int) -> None:
+    def accept(self, name: str, value: int) -> None:
+        """Do what a value that may be written asks for."""
         if name == "torque_enable" and value and not self.get("torque_enable"):
             if self.get("operating_mode") == POSITION_MODE:
                 self._count_one_turn()
-            self.put(
-                "goal_position", self.get("present_position")
-            )  # a motor does not jump when switched on
+            # A motor does not jump when switched on.
+            self.put("goal_position", self.get("present_position"))
         if name == "operating_mode" and value != self.get(name):
             for item in MODE_ITEMS:
                 self.put(item, self.items[item].initial)

@@ -79,7 +79,7 @@ class MotorTerminal(MotorLine):
             listener.join()
 
     def _serve_once(self) -> None:
-        wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
+        wait_s = max(0.0, min(IDLE_S, self.due_s - self.clock.now()))
         try:
             at, heard = self._heard.get(timeout=wait_s)
         except Empty:
@@ -95,7 +95,7 @@ class MotorTerminal(MotorLine):
         while not self._end.is_set():
             if not select.select([self._near], [], [], IDLE_S)[0]:
                 continue
-            at = self._clock.now()
+            at = self.clock.now()
             with contextlib.suppress(OSError):
                 self._heard.put((at, os.read(self._near, LONGEST)))
 

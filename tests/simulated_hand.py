@@ -87,6 +87,7 @@ def simulated_bus(
     clock = SimulatedClock()
     port = SimulatedPort(clock)
     port.line = line = MotorLine(make_motors(joints), plant, clock=clock, put=port.put)
+    line.port = port
     stop = clock.every(TICK_S, line.go_on)
     with MotorBus(port, joints.ids, joints.models, clock=clock) as bus:
         bus.configure(joints.settings())

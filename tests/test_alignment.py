@@ -162,9 +162,8 @@ def test_a_reset_begins_anew(near_sighted):
     goal, seen = clouds(torch.arange(2.0))
     aligner = Aligner(network, goal)
     aligner.look(seen)
-    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(
-        np.float32
-    )  # it was wrong
+    # It was wrong.
+    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(np.float32)
     aligner.reset(torch.tensor([True, False]))
     first = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert first[0] < 0.2 and first[1] > 0.5
@@ -292,8 +291,8 @@ def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
 
 def test_shapes_are_renewed_from_the_oldest(scenes):
     bank, *_ = scenes
-    before = bank._shapes.clone()
+    before = bank.shapes.clone()
     bank.renew(3)
     bank.renew(4)
-    same = (bank._shapes == before).flatten(1).all(dim=1)
+    same = (bank.shapes == before).flatten(1).all(dim=1)
     assert int((~same).sum()) == 7

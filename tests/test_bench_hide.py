@@ -117,7 +117,7 @@ def test_effects_are_read_from_the_command_line():
         {"tau_s_nm": 0.2, "v_s_rad_s": 0.1},
     )
     for text in ("backlash:width_rad", "backlash:width_rad=wide"):
-        with pytest.raises(ValueError, match="write width_rad=NUMBER"):
+        with pytest.raises(ValueError, match="width_rad=NUMBER"):
             parse_effect(text)
 
 

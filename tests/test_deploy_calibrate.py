@@ -146,9 +146,8 @@ def test_noisy_views_err_as_predicted(hand, camera, lens, poses):
         errors.append(np.linalg.norm(misplaced(found.camera, camera)))
         predicted.append(found.point_error(hand.goal_in_base))
     share = np.mean(covered)
-    assert 0.90 < share < 0.995, (
-        share
-    )  # 240 correlated components; the sandwich is known to be careful
+    # 240 correlated components; the sandwich is known to be careful.
+    assert 0.90 < share < 0.995, share
     assert np.quantile(errors, 0.95) < 1.3 * np.median(predicted)
     assert np.median(errors) > 0.15 * np.median(predicted)
 

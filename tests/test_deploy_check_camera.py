@@ -67,14 +67,11 @@ def test_a_camera_that_falls_silent_is_named_and_nothing_else_looked_at(images):
 
 def test_few_and_old_images_are_named():
     slow = look(Camera(fps=15.0))
-    assert (
-        wrong(slow) == ["rate"]
-        and "15.0 images a second, not 30: use a USB 3 cable" in slow["rate"][1]
-    )
+    assert wrong(slow) == ["rate"] and "15.0 images a second" in slow["rate"][1]
     old = look(Camera(age_s=0.2))
     assert wrong(old) == ["rate"] and "200 ms old" in old["rate"][1]
     ahead = look(Camera(age_s=-1.0))
-    assert wrong(ahead) == ["rate"] and "images are 1.00 s from the future" in ahead["rate"][1]
+    assert wrong(ahead) == ["rate"] and "1.00 s from the future" in ahead["rate"][1]
 
 
 def test_a_camera_that_looks_elsewhere_is_named():
@@ -88,10 +85,9 @@ def test_depth_counts_where_the_object_is_handled():
     depth = np.full((180, 320), 0.6, dtype=np.float32)
     depth[int(row) - 40 : int(row) + 40, int(column) - 40 : int(column) + 40] = 0.0
     found = look(Camera(depth=depth))
-    assert wrong(found) == ["depth"] and "0 % of the pixels around" in found["depth"][1]
-    assert "depth" in wrong(
-        look(Camera(depth=np.full((180, 320), 9.0, dtype=np.float32)))
-    )  # out of range
+    assert wrong(found) == ["depth"] and "0 % of the pixels" in found["depth"][1]
+    # Out of range.
+    assert "depth" in wrong(look(Camera(depth=np.full((180, 320), 9.0, dtype=np.float32))))
     rng = np.random.default_rng(0)
     for noise_m, blind in ((0.002, []), (0.03, ["depth"])):
         noisy = rng.normal(0.6, noise_m, (180, 320)).astype(np.float32)

@@ -85,8 +85,8 @@ def stubborn(line):
     """A motor that does not keep a limit."""
     motor, item = line.motors[4], "max_position_limit"
     motor.put(item, 4000)
-    accept = motor._accept
-    motor._accept = lambda name, value: accept(name, 4000 if name == item else value)
+    accept = motor.accept
+    motor.accept = lambda name, value: accept(name, 4000 if name == item else value)
 
 
 def low(line):
@@ -131,16 +131,16 @@ def test_the_preflight_finds(name, line, monkeypatch):
     monkeypatch.setattr(check, "CYCLES", 1)
     spoil, said = SPOILT[name]
     spoil(line)
-    line._clock.sleep(0.05)
+    line.clock.sleep(0.05)
     with record.connect(None) as connection, pytest.raises(RuntimeError, match=said):
-        connection.bus._states.forget()
+        connection.bus.states.forget()
         check.ready(connection, "It moves.", yes=True)
     assert not any(motor.get("torque_enable") for motor in line.motors)
 
 
 def test_nothing_moves_unasked(line, monkeypatch):
     before = line.plant.position.copy()
-    with pytest.raises(RuntimeError, match="Nobody is there to ask"):
+    with pytest.raises(RuntimeError, match="Nobody is there"):
         home.home(home.HomeCfg(port=PORT))
     line.motors[3].put("hardware_error_status", 32)
     with pytest.raises(RuntimeError, match="motor 20: overload"):
@@ -162,16 +162,16 @@ def test_nothing_is_written_before_the_person_agreed(line, torque, capsys):
     assert check.check(check.CheckCfg(port=PORT, no_camera=True)) == 0
     said = capsys.readouterr().out
     assert ("motors 10, 11 hold" in said) == torque and "10: 900; will be set to 200" in said
-    with pytest.raises(RuntimeError, match="Nobody is there to ask"):
+    with pytest.raises(RuntimeError, match="Nobody is there"):
         home.home(home.HomeCfg(port=PORT))
-    assert ("motors 10, 11 hold, with up to 0." in capsys.readouterr().out) == torque
+    assert ("motors 10, 11 hold" in capsys.readouterr().out) == torque
     assert [bytes(motor.memory[:PRESENT]) for motor in line.motors] == settings
 
 
 @pytest.fixture
 def on_the_way(line):
     """Have something done while the hand moves: the preflight takes two seconds."""
-    clock, stops = line._clock, []
+    clock, stops = line.clock, []
 
     def schedule(do):
         def once():
@@ -195,7 +195,7 @@ def test_a_hand_stopped_by_a_signal_ends_its_command_so(line, on_the_way, number
 def test_home_comes_to_the_start_pose(line, hand, capsys):
     assert home.home(home.HomeCfg(port=PORT, yes=True, speed=1.0, safety=QUICK)) == 0
     np.testing.assert_allclose(line.plant.position, hand.start, atol=0.01)
-    assert "farthest from its place" in capsys.readouterr().out
+    assert "farthest from" in capsys.readouterr().out
 
 
 def test_a_wiggle_takes_fingertips_away_from_what_they_lean_on(hand):
@@ -206,9 +206,9 @@ def test_a_wiggle_takes_fingertips_away_from_what_they_lean_on(hand):
     highest = np.array(hand.upper)
     for axis in range(hand.num_joints):
         finger = hand.joint_finger[axis]
-        turned = check._free_turn(hand, leaning, axis)
+        turned = check.free_turn(hand, leaning, axis)
         assert out_m(turned, finger) >= out_m(leaning, finger)
-        assert check._free_turn(hand, highest, axis)[axis] < highest[axis]
+        assert check.free_turn(hand, highest, axis)[axis] < highest[axis]
 
 
 def test_each_joint_wiggles_in_turn_as_it_is_told_and_only_after_a_yes(
@@ -218,7 +218,7 @@ def test_each_joint_wiggles_in_turn_as_it_is_told_and_only_after_a_yes(
     monkeypatch.setattr(check, "CYCLES", 1)
     monkeypatch.setattr(check, "WIGGLE_RAD_S", 1.0)
     asked = check.CheckCfg(port=PORT, wiggle=True, no_camera=True)
-    with pytest.raises(RuntimeError, match=r"turn by 5 degrees.*Nobody is there to ask"):
+    with pytest.raises(RuntimeError, match=r"by 5 degrees.*Nobody is there"):
         check.check(asked)
     assert not any(motor.get("torque_enable") for motor in line.motors)
     advance, turns, home = line.plant.advance, [], line.plant.position.copy()
@@ -243,6 +243,15 @@ def test_each_joint_wiggles_in_turn_as_it_is_told_and_only_after_a_yes(
     assert re.search(f"watch f0_j2, motor 11: the tip of finger 0 goes 1. mm {way}\n", told)
     assert re.search(r"WRONG  wiggle of f1_j1 .*turned by .0\.0 of .5 deg: blocked", out)
     assert out.count("ok     wiggle of") == 8
+
+
+def test_nothing_wiggles_and_nobody_is_asked_while_something_is_wrong(line, monkeypatch, capsys):
+    monkeypatch.setattr(check, "CYCLES", 1)
+    low(line)
+    line.clock.sleep(0.05)
+    assert check.check(check.CheckCfg(port=PORT, wiggle=True, no_camera=True)) == 1
+    assert "WRONG" in capsys.readouterr().out
+    assert not any(motor.get("torque_enable") for motor in line.motors)
 
 
 @pytest.fixture
@@ -315,8 +324,7 @@ def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
     cfg = record.RecordCfg(
         port=PORT, out=tmp_path, fingers=(0,), plan=motion, yes=True, safety=QUICK, realtime=False
     )
-    with record.connect(cfg) as connection:
-        connection.bus._port.lag_s = 0.016
+    line.port.lag_s = 0.016
     assert record.record(cfg) == 0
     rate = re.search(
         r"at (\d+) Hz, not 100: .*latency timer.* --rate-hz \1", capsys.readouterr().err
@@ -336,9 +344,9 @@ def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand,
     for file, fault in (("of_another.csv", "f9_j1"), ("gone.csv", "gone.csv")):
         plan = {"trajectories": [{"file": file}], "joints": ["f9_j1"]}
         (tmp_path / "next_experiment.json").write_text(json.dumps(plan))
-        with pytest.raises(record.RecordError, match=f"no plan for dclaw3: .*{fault}"):
+        with pytest.raises(record.RecordError, match=f"plan for dclaw3: .*{fault}"):
             record.read_plan(tmp_path, joints)
-    with pytest.raises(record.RecordError, match="no plan for dclaw3"):
+    with pytest.raises(record.RecordError, match="plan for dclaw3"):
         record.read_plan(tmp_path / "nowhere.json", joints)
 
 
@@ -383,23 +391,29 @@ def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
 
 
 @pytest.fixture
-def twin(hand):
-    """A twin on a simulated clock, of motors that turn the other way and are mounted elsewhere."""
-    turned = [replace(motor, sign=-1.0, offset_rad=0.2) for motor in hand.motors]
-    return Twin(JointMotors(hand, tuple(turned)), clock=SimulatedClock())
+def turned(hand):
+    """Motors that turn the other way and are mounted elsewhere."""
+    motors = [replace(motor, sign=-1.0, offset_rad=0.2) for motor in hand.motors]
+    return JointMotors(hand, tuple(motors))
 
 
-def test_a_twin_does_what_motors_do(twin, hand):
+@pytest.fixture
+def twin(turned):
+    """A twin of them on a simulated clock."""
+    return Twin(turned, clock=SimulatedClock())
+
+
+def test_a_twin_does_what_motors_do(twin, turned, hand):
     """Soft at first, to the goal, held at less than its stiffness, and let go at the end."""
     goal = hand.start + np.tile([0.1, 0.2, 0.2], 3)
-    with SafeHand(twin, twin._joints, QUICK, lambda text: None) as safe:
+    with SafeHand(twin, turned, QUICK, lambda text: None) as safe:
         begin = safe.arm().position
         np.testing.assert_allclose(begin, hand.start, atol=0.003)
         safe.move(goal, 1.0)
         here = safe.read()
         np.testing.assert_allclose(here.position, goal, atol=0.05)
         # Gravity bends the joints by torque over stiffness, and the current says so.
-        model = twin._joints.models[0]
+        model = turned.models[0]
         torque = here.current * model.torque_nm_per_a
         np.testing.assert_allclose(torque / hand.kp, goal - here.position, atol=0.01)
         twin.stiffen(0.3, twin.ids[:3])
@@ -414,12 +428,12 @@ def test_a_twin_does_what_motors_do(twin, hand):
     assert not twin.read_torque().any() and safe.report.unreleased == {}
     for _ in range(20):
         twin.clock.sleep(0.05)
-        fallen = twin._joints.state(twin.read_state()).position
+        fallen = turned.state(twin.read_state()).position
     assert np.abs(fallen - goal).max() > 0.3
 
 
-def test_a_twin_that_is_told_to_freeze_stays_where_it_is(twin, hand):
-    with SafeHand(twin, twin._joints, QUICK, lambda text: None) as safe:
+def test_a_twin_that_is_told_to_freeze_stays_where_it_is(twin, turned, hand):
+    with SafeHand(twin, turned, QUICK, lambda text: None) as safe:
         safe.arm()
         safe.command(hand.start + 0.3)
         twin.clock.sleep(0.03)
@@ -437,4 +451,4 @@ def test_check_of_a_twin_looks_at_its_camera(capsys):
 
 def test_a_twin_that_cannot_be_says_why(capsys):
     assert cli.main(["check", "--twin", "--hand", "nobody"]) == 1
-    assert "no hand is called" in capsys.readouterr().err
+    assert "no hand" in capsys.readouterr().err

@@ -87,11 +87,9 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
     np.testing.assert_array_equal(again.offset, turned.offset)
     for name in ("dclaw4", ""):  # another hand may have joints of the same names
         save(turned, path, name)
-        with pytest.raises(CalibrationError, match=rf"motors\.json .*hand names '{name}'.*dclaw3"):
+        with pytest.raises(CalibrationError, match=rf"motors\.json .*names '{name}'.*dclaw3"):
             read_joints(hand, path)
-    with pytest.raises(
-        CalibrationError, match=r"^--calibration \S+none\.json: No such file.*leave it out"
-    ):
+    with pytest.raises(CalibrationError, match=r"^--calibration \S+none\.json: .*leave"):
         read_joints(hand, tmp_path / "none.json")
 
 

@@ -211,14 +211,12 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
 
     log = LogWriter(tmp_path / "log", load_hand("dclaw3"), {"goals": GOALS}, servo={})
     monkeypatch.setattr("vd.deploy.loop.log.os.write", full)
-    with pytest.raises(
-        OSError, match=r"cannot write .*log: No space left on device; free some space"
-    ):
+    with pytest.raises(OSError, match=r"log: No space left.*free"):
         log.finish("done")
 
 
 def test_what_is_no_log_is_refused(folder, tmp_path):
-    with pytest.raises(LogError, match=r"there is no run\.json"):
+    with pytest.raises(LogError, match=r"run\.json"):
         read_log(tmp_path)
     run = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps({**run, "format": "vd-hand-log/0"}))

@@ -198,7 +198,7 @@ def test_an_action_that_is_not_finite_stops_the_hand(looped, value):
         action[4] = value if len(where) > 5 else 0.0
         return PolicyDecision(action, 9.0)
 
-    with pytest.raises(ValueError, match="the policy's action is not finite"):
+    with pytest.raises(ValueError, match="action is not finite"):
         looped(decide)
     motors, last = where[-1]
     assert not any(motor.get("torque_enable") for motor in motors) and len(where) == 6
@@ -214,7 +214,7 @@ def test_a_policy_that_hangs_is_stopped_and_it_is_said(looped):
         states.append(sum(motor.get("torque_enable") for motor in line.motors))
         return PolicyDecision(np.zeros(9), 9.0)
 
-    with pytest.raises(StoppedError, match="the loop stands: no step ended for 0"):
+    with pytest.raises(StoppedError, match="the loop stands"):
         looped(decide)
     assert states == [9, 9, 9, 0], "it hung with its torque on"
 
@@ -224,7 +224,7 @@ def test_a_first_look_that_does_not_end_is_stopped(looped):
         clock.sleep(60.0)
         return PolicyDecision(np.zeros(9), 9.0)
 
-    with pytest.raises(StoppedError, match="the policy has not decided for 10 s"):
+    with pytest.raises(StoppedError, match="not decided for 10 s"):
         looped(decide)
 
 
@@ -333,7 +333,7 @@ def test_a_camera_that_goes_blind_stops_the_hand(parts, spoil, said):
         if not said:
             assert loop.run([GOAL]) == ["time limit"]
             return
-        with pytest.raises(StoppedError, match=rf"the camera is blind for 0\.\d\d s: {said}"):
+        with pytest.raises(StoppedError, match=rf"camera is blind .*{said}"):
             loop.run([GOAL])
         assert camera.images <= round(HZ) + 8
 
@@ -425,12 +425,10 @@ def test_latency_is_told_as_training_draws_it(parts):
     loop.run([GOAL])
     log.finish("done")
     found = summary(loop.times)
-    assert found["observation_latency_ms"]["median"] == pytest.approx(
-        40.0
-    )  # the image, when joints are read
-    assert found["command_delay_ms"]["median"] == pytest.approx(
-        20.0
-    )  # from then until goals are sent
+    # The image, when joints are read.
+    assert found["observation_latency_ms"]["median"] == pytest.approx(40.0)
+    # From then until goals are sent.
+    assert found["command_delay_ms"]["median"] == pytest.approx(20.0)
     np.testing.assert_allclose(read_log(log.folder).columns["image_s"], 0.005 - 0.04, atol=1e-6)
     blind = summary([replace(loop.times[0], image_s=np.nan)])
     assert "observation_latency_ms" not in blind and "command_delay_ms" in blind
@@ -466,11 +464,12 @@ def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
         "--log",
         str(folder),
     ]
+    # The second 2 rad away, so that it takes a while.
     goals = [
         "--goal",
         "0,0,0,1",
         "0,0,0.84147,0.5403",
-    ]  # the second 2 rad away, so that it takes a while
+    ]
     status, out, words = driven([*flags, *patient, *goals], capsys)
     assert status == 0, words
     log = read_log(folder)
@@ -507,10 +506,10 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
     assert status == 1 and "81 deg C" in words
     assert all(image.shape == (180, 320) and (image > 0.0).mean() > 0.5 for image in seen)
     assert read_log(folder).run["kind"] == "tracking"
-    assert "goal 1: not reached: aborted" in out
+    assert "goal 1: not reached" in out
     page = (folder / PAGE_FILE).read_text()
     assert "aborted" in page and (folder / FILM_FILE).stat().st_size > 1000
-    assert "81 deg C, over 70" in page and "The torque of every motor is off" in page
+    assert "81 deg C, over 70" in page and "torque of every motor is off" in page
 
 
 @pytest.mark.parametrize(

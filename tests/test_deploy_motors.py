@@ -124,7 +124,7 @@ def test_states_are_in_the_units_of_each_model_and_a_wrong_model_is_named(monkey
         line.plant.position[:] = joints.to_motor(hand.start)
         bus.clock.sleep(0.02)
         connection = Connection(joints, bus)
-        bus._states.forget()
+        bus.states.forget()
         assert [one.words for one in check.preflight(connection) if not one.ok] == []
         position, velocity, torque = line.plant.read()
         torque[:3] = 0.93 / 2, 1.5 / 2, 3.0 / 2  # half of what they stall at

@@ -32,7 +32,7 @@ class Rig:
 
     def findings(self):
         """What the preflight finds, by name."""
-        self.bus._states.forget()
+        self.bus.states.forget()
         return {one.what: one for one in check.preflight(self.connection)}
 
     def wrong(self) -> list[str]:
@@ -82,9 +82,9 @@ def test_a_motor_whose_firmware_has_no_watchdog_is_refused_and_a_newer_one_is_no
 
 
 def test_another_operating_mode_is_set_before_the_gains_that_it_resets(rig):
-    accept = rig.motor._accept
+    accept = rig.motor.accept
     order = []
-    rig.motor._accept = lambda name, value: (order.append(name), accept(name, value))
+    rig.motor.accept = lambda name, value: (order.append(name), accept(name, value))
     rig.motor.put("operating_mode", 4)
     rig.bus.configure(rig.connection.joints.settings())
     assert order.index("operating_mode") < order.index("position_p_gain")

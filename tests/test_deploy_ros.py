@@ -153,20 +153,20 @@ def test_a_hand_behind_ros_pursues_goals_of_the_service_until_it_is_told_to_fini
 def test_what_is_missing_old_or_of_other_names_is_said_and_nothing_moves(capsys):
     line = "zero --ros2 --yes --no-realtime"
     assert cli.main(line.split()) == 1
-    assert "none of dclaw3 on /joint_states: start its driver, or remap" in capsys.readouterr().err
+    assert "dclaw3 on /joint_states" in capsys.readouterr().err
     hand = RosHand(HAND, make_node("a"))
     few = Message(header=stamped(), name=["f0_j1"], position=[0.0], velocity=[0.0])
     publish("/joint_states", few)
-    assert "lacks f0_j2; names are those of the hand's USD" in next(hand.findings()).words
+    assert "lacks f0_j2" in next(hand.findings()).words
     with pytest.raises(SilentError, match="JointState lacks f0_j2"):
         hand.read_state()
     whole = {"name": HAND.joint_names, "position": HAND.upper + 1.0, "velocity": HAND.upper}
     publish("/joint_states", Message(header=stamped(9.0), **whole))
-    with pytest.raises(SilentError, match="no new JointState on /joint_states"):
+    with pytest.raises(SilentError, match="JointState on /joint_states"):
         hand.read_state()
     states, commands, pose = hand.findings()
     assert "fewer than 24" in states.words and "set clocks" in states.words and not states.ok
-    assert "nobody listens on /commands" in commands.words and "f0_j1" in pose.words
+    assert "on /commands" in commands.words and "f0_j1" in pose.words
 
 
 def test_states_and_images_from_the_future_are_refused_with_their_topic():
@@ -224,16 +224,16 @@ def test_depth_comes_in_either_encoding_with_its_age_and_other_images_are_refuse
         frame = camera.read(0.1)
         np.testing.assert_allclose(frame.image, 1e-3 * rows, rtol=1e-6)
         assert 0.04 < time.monotonic() - frame.time_s < 0.5
-    with pytest.raises(StaleCamera, match="no image on /depth/image_rect_raw"):
+    with pytest.raises(StaleCamera, match="image on /depth/image_rect_raw"):
         camera.read(0.01)
     publish("/depth/image_rect_raw", Message(header=stamped(-1.0), data=data, **size))
-    with pytest.raises(CameraError, match=r"an image on /depth/image_rect_raw is \d.\d\d s from"):
+    with pytest.raises(CameraError, match=r"/depth/image_rect_raw is \d.\d\d s"):
         camera.read(0.1)
     publish("/depth/image_rect_raw", Message(header=stamped(), encoding="rgb8"))
-    with pytest.raises(CameraError, match=r"images are rgb8; depth is 16UC1 or 32FC1"):
+    with pytest.raises(CameraError, match=r"rgb8; .*16UC1 or 32FC1"):
         camera.read(0.1)
     camera.close()
     with pytest.raises(CameraError, match="distorted"):
         opened(Message(**{**vars(lens), "d": [0.1]}))
-    with pytest.raises(CameraError, match="no camera_info on /depth/camera_info"):
+    with pytest.raises(CameraError, match="/depth/camera_info"):
         RosCamera(node)

@@ -264,6 +264,17 @@ def test_on_a_lost_bus_what_presses_on_an_obstacle_is_let_go(bus, line, hand, jo
         assert push(line).max() < 0.002
 
 
+def test_where_the_adapter_is_gone_every_motor_is_named(bus, line, joints):
+    def gone(_):
+        raise OSError("no adapter")
+
+    with SafeHand(bus, joints, QUICK) as safe:
+        safe.arm()
+        line.port.writePort = gone
+        assert "no adapter" in run_until_stopped(safe, START)
+    assert sorted(safe.report.unreleased) == sorted(bus.ids)
+
+
 def test_a_blocked_joint_is_let_go(bus, line, hand, joints):
     with SafeHand(bus, joints, replace(QUICK, step_rad=4.0, current_s=0.3)) as safe:
         here = safe.arm().position
@@ -320,7 +331,7 @@ def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
     with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
-        with pytest.raises(StoppedError, match=r"image is 3\.00 s from the future: wait .*plug"):
+        with pytest.raises(StoppedError, match=r"3\.00 s from the future: .*plug"):
             safe.image_at(bus.clock.now() + 3.0)
 
 
@@ -425,7 +436,7 @@ def test_all_threads_run_before_other_programs_and_not_after():
 
 
 def test_settings_that_switch_a_limit_off_are_refused(bus, hand, joints):
-    with pytest.raises(ValueError, match=r"safety\.step_rad is 0"):
+    with pytest.raises(ValueError, match=r"step_rad is 0"):
         SafetyCfg(step_rad=0.0)
-    with pytest.raises(ValueError, match=r"safety\.margin_rad is 2"):
+    with pytest.raises(ValueError, match=r"margin_rad is 2"):
         SafeHand(bus, joints, SafetyCfg(margin_rad=2.0))

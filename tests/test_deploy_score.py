@@ -96,10 +96,11 @@ NONE = np.array([[0.0, 0.0, 0.0, 1.0]])
 
 def test_errors_are_those_at_the_stops_and_lost_markers_discard(run, tmp_path):
     ends = [stop.time_s for stop in run.log.stops]
+    # At a stop, and on the way.
     lost = [
         (ends[2] - 0.5, ends[2] + 0.5),
         (ends[0] + 1.0, ends[0] + 2.0),
-    ]  # at a stop, and on the way
+    ]
     mocap = read_mocap(run.export(tmp_path / "m.csv", lost=lost))
     errors = stop_errors(run.log, mocap, NONE, offset_s=0.0)
     assert np.isnan(errors).tolist() == [False, False, True, False, False, False]

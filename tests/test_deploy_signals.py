@@ -135,7 +135,7 @@ def test_no_signal_cuts_off_the_stop(driver, number, pauses):
     # What comes after the motors are off and the handlers are gone may end the process itself.
     assert driven.press(number, *pauses) in (128 + number, -number)
     assert energised(driven.twin) == []
-    assert "torque off" in driven.words() and "may still be on" not in driven.words()
+    assert "torque off" in driven.words() and "may still be" not in driven.words()
 
 
 def test_a_command_is_stopped_whole(driver):
@@ -154,7 +154,7 @@ def test_a_policy_that_hangs_where_no_signal_is_heard_is_stopped_and_ended(drive
 def test_a_policy_that_hangs_does_not_keep_the_torque_on(driver):
     driven = driver("hang")
     driven.until(lambda: not energised(driven.twin) and "torque off" in driven.words())
-    assert "stopping: the loop stands: no step ended for" in driven.words()
+    assert "stopping: the loop stands" in driven.words()
     assert driven.press(signal.SIGTERM, 0.0) == 143
 
 
@@ -164,4 +164,4 @@ def test_motors_that_cannot_be_reached_are_named_however_often_it_is_asked_to_en
     driven.twin.faults.cut_off.update(motor.id for motor in driven.twin.motors)
     assert driven.press(signal.SIGINT, 0.5, 0.3, 0.3) in (1, 130)
     for motor in driven.twin.motors:
-        assert f"motor {motor.id} may still be on, cut its power: " in driven.words()
+        assert f"motor {motor.id} may still be on, " in driven.words()

@@ -127,4 +127,4 @@ def test_the_command_writes_a_page_and_refuses_sizes_that_fit_none(tmp_path, cap
     assert data.startswith(b"%PDF") and b"841.88" in data, "A4"
     assert "--pose tags:0.06" in capsys.readouterr().out
     assert cli.main(["tags", "--size", "7", str(tmp_path / "b.pdf")]) == 1
-    assert "give the side of the cube in metres" in capsys.readouterr().err
+    assert "cube in metres" in capsys.readouterr().err

@@ -223,7 +223,7 @@ def test_objects_can_start_at_rest():
 
 def test_lost_contacts_stop_the_run_and_name_the_setting():
     env = make(sim=dataclasses.replace(SimCfg(), njmax=8))
-    with pytest.raises(SimulationError, match=r"raise sim\.njmax \(now 8\)"):
+    with pytest.raises(SimulationError, match=r"sim\.njmax \(now 8\)"):
         run(env, 30)
 
 
@@ -242,7 +242,7 @@ def test_a_policy_that_gives_no_number_ends_the_run(tolerant):
     run(env, 2)
     before = env.sim.joint_q.numpy()[2, : env.num_joints].copy()
     env.action.numpy()[2, 0] = np.nan
-    with pytest.raises(ValueError, match=r"1 actions were not finite \(first: environment 2\)"):
+    with pytest.raises(ValueError, match=r"environment 2"):
         for _ in range(2):
             env.step(env.action)
     moved = np.abs(env.sim.joint_q.numpy()[2, : env.num_joints] - before).max()
@@ -279,7 +279,7 @@ def test_a_run_goes_on_without_the_few_worlds_that_fail(effects):
     for _ in range(40):
         env.sim.joint_qd.numpy()[1, 0] = np.nan
         env.step(env.action)
-    with pytest.raises(SimulationError, match=r"4 of \d+ environments left the finite numbers"):
+    with pytest.raises(SimulationError, match=r"4 of \d+ environments"):
         env.check()
 
 

@@ -29,9 +29,8 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
     What was observed, before the first step too, and what was true.
     """
     quats = Rotation.random(WORLDS, rng=np.random.default_rng(1)).as_quat()
-    env.state.rng.assign(
-        np.arange(WORLDS, dtype=np.uint32)
-    )  # building one drew a latency, another did not
+    # Building one drew a latency, another did not.
+    env.state.rng.assign(np.arange(WORLDS, dtype=np.uint32))
     env.reset(object_quat=quats, goal_quat=quats[::-1])
     rng = np.random.default_rng(seed)
     seen, rewards, states = [env.observation.numpy().copy()], [], [env.sim.joint_q.numpy().copy()]
@@ -67,9 +66,8 @@ def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(
         ages[parts[name]] = hand_late
     for name in ("goal_orientation", "previous_action"):  # known, not measured
         ages[parts[name]] = 0
-    if (
-        object_late != hand_late
-    ):  # a late object and other fingertips: what lies between them is of no state
+    # A late object and other fingertips: what lies between them is of no state.
+    if object_late != hand_late:
         ages[parts["previous_action"].stop :][:9] = -1
     for step in range(8):
         for age in set(ages) - {-1}:
@@ -168,12 +166,10 @@ def test_a_tracker_that_drops_every_pose_shows_the_start_and_has_ages_of_its_own
     assert not np.ptp(seen[..., parts["object_position"]], axis=0).any()
     assert not seen[..., parts["object_velocity"]].any()
     both = dataclasses.replace(tracked(), observation_latency_s=(0.0, 0.1))
-    with pytest.raises(
-        ValueError, match=r"tracked_pose has ages of its own: leave observation_lat"
-    ):
+    with pytest.raises(ValueError, match=r"tracked_pose .*leave observation_lat"):
         make(randomisation=both)
     slow = TrackedPoseCfg(rate_hz=(0.5, 30.0))
-    with pytest.raises(ValueError, match=r"tracked_pose.rate_hz is 0.5 30; it has to rise from 2"):
+    with pytest.raises(ValueError, match=r"rate_hz is 0.5 30; .*2"):
         make(randomisation=dataclasses.replace(EXACT, tracked_pose=slow))
 
 

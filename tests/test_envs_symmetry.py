@@ -157,9 +157,7 @@ def test_mirrored_worlds_look_and_move_the_same():
 
 def test_a_hand_whose_fingers_lean_is_no_mirror_image():
     cfg = dataclasses.replace(CFG, hand="dclaw4", observation=ObservationCfg(view="mirrored"))
-    with pytest.raises(
-        ValueError, match=r"dclaw4 is not its own mirror image; set observation\.view to goal"
-    ):
+    with pytest.raises(ValueError, match=r"dclaw4 .*observation\.view to goal"):
         ReorientEnv(cfg, "cpu")
 
 

@@ -113,7 +113,7 @@ def test_ones_own_suite_is_a_file_of_command_lines(tmp_path, asked, capsys):
         own.write_text(text)
         assert main(flags) == 1 and message in capsys.readouterr().err
     assert main([*flags[:2], "nothing", "--out", str(tmp_path)]) == 1
-    assert "give benchmark, paper, robust, or a YAML file" in capsys.readouterr().err
+    assert "benchmark, paper, robust, or a YAML" in capsys.readouterr().err
 
 
 def test_everything_is_run_once_and_only_what_changed_again(tmp_path, asked, monkeypatch):
@@ -186,7 +186,7 @@ def test_what_fails_costs_no_other_and_is_measured_by_the_next_call(
     monkeypatch.setattr(suite_run, "compare", fails)
     assert command(tmp_path) == status
     text, said = read_page(tmp_path / "out" / "paper.html")[0], capsys.readouterr().err
-    assert ("Nothing has been measured yet" in text) == (left_out == OF_TEACHERS)
+    assert ("Nothing has been measured" in text) == (left_out == OF_TEACHERS)
     assert status == 130 or ("spoon" in said and "spoon" in text)
     written = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert {condition for condition, *_ in written["missing"]} == set(left_out)
@@ -204,7 +204,7 @@ def test_the_papers_figures_stand_beside_ours(tmp_path, asked):
     assert ours[TEACHER] == "–" and ours[CAMERA].startswith("0.0 %"), "the double stops at 0.65 rad"  # noqa: RUF001
     assert figures["states within 0.4 rad up to symmetry seen so", "air"][CAMERA] == "100.0 %"
     text, _ = read_page(tmp_path / "out" / "paper.html")
-    assert "72.3 %" in text and "Held-out objects judge" in text and "our own" not in text
+    assert "72.3 %" in text and "Held-out objects" in text and "our own" not in text
 
 
 def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monkeypatch):
@@ -256,9 +256,7 @@ def test_our_objects_stand_for_the_papers_where_none_are_given():
     assert groups["training"].sets == OWN_SETS["training"] and "our own" in groups["held-out"].text
     left_out = set(SHIPPED_POLICIES) - set(EvalCfg(suite="paper").agent_names)
     assert left_out == {"allegro-cube", "leap-cube", "leap-objects"}, "not imported"
-    with pytest.raises(
-        ValueError, match="'table' is no group of the suite; training, validation, held-out"
-    ):
+    with pytest.raises(ValueError, match=r"'table' .*training, validation, held-out"):
         suite_run.object_groups(("table=cube",), wanted)
 
 

@@ -58,9 +58,7 @@ def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
     path.write_bytes(b"old")
     with (
         small_files(LIMIT),
-        pytest.raises(
-            OutputError, match=rf"cannot write .*{name}: File too large; free some space"
-        ),
+        pytest.raises(OutputError, match=rf"{name}: .*free some space"),
     ):
         write(path)
     assert path.read_bytes() == b"old"
@@ -92,7 +90,7 @@ def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_
     check_file(tmp_path / "new.txt")
     assert [path.name for path in tmp_path.iterdir()] == ["file"] and not capsys.readouterr().err
     check_file(tmp_path / "file")
-    assert "file is there, and will be replaced" in capsys.readouterr().err
+    assert "will be replaced" in capsys.readouterr().err
 
 
 def commands(taken: str) -> dict[str, list[str]]:
@@ -136,5 +134,5 @@ def test_every_command_says_so_at_once(tmp_path, command, monkeypatch, capsys):
         status = end.code
     text = capsys.readouterr().err + str(status)
     assert status
-    assert "cannot write" in text and "file is a file; choose another path" in text
+    assert "cannot write" in text and "choose another path" in text
     assert "Traceback" not in text and not list(tmp_path.glob("file/*"))

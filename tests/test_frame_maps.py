@@ -45,9 +45,8 @@ def maps(env):
     def array(values, dtype):
         return torch.tensor(values, dtype=getattr(torch, dtype))
 
-    return FrameMaps(
-        env.hand, replace(env.cfg.observation, dynamics="critic"), array
-    )  # who is not asked
+    # Who is not asked.
+    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"), array)
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):

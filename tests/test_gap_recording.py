@@ -344,7 +344,7 @@ def test_joints_that_no_motion_or_few_move_are_named(machine):
     (idle,) = cautions(first)
     assert "No motion moves b" in idle
     few = replace(first, trajectories=first.trajectories[:2])
-    assert any("Fewer than 3 kinds of motion move a:" in line for line in cautions(few))
+    assert any("3 kinds of motion" in line for line in cautions(few))
 
 
 def test_samples_far_apart_are_told(machine):

@@ -64,24 +64,18 @@ def test_gymnasium_finds_no_fault_and_episodes_end_as_the_mode_says(mode):
 
 
 def test_widths_masks_devices_and_settings_that_cannot_be_are_refused():
-    with pytest.raises(ValueError, match=r"reward has no field sucess; is it success\?"):
+    with pytest.raises(ValueError, match=r"sucess; .*success\?"):
         gymnasium.make_vec("vd.gym:VisualDexterity-v0", 2, device="cpu", reward={"sucess": 1.0})
-    with pytest.raises(
-        ValueError, match="device is 'cuda:99'; it has to be auto, or of those here: cpu"
-    ):
+    with pytest.raises(ValueError, match=r"'cuda:99'; .*cpu"):
         gymnasium.make_vec("vd.gym:VisualDexterity-v0", 2, device="cuda:99")
     env = gymnasium.make_vec("vd.gym:VisualDexterity-v0", 2, device="auto", hand="dclaw3")
-    with pytest.raises(ValueError, match=r"actions have shape \(9,\), not \(2, 9\)"):
+    with pytest.raises(ValueError, match=r"\(9,\), not \(2, 9\)"):
         env.step(np.zeros(9))
-    with pytest.raises(
-        ValueError, match=r"reset_mask is torch.int64 \(2,\); give booleans, \(2,\)"
-    ):
+    with pytest.raises(ValueError, match=r"torch.int64 \(2,\); give booleans"):
         env.reset(options={"reset_mask": np.array([0, 1])})
-    with pytest.raises(
-        ValueError, match=r"actions are an array \(2, 9\) of wp.from_torch, not tensor"
-    ):
+    with pytest.raises(ValueError, match=r"\(2, 9\) of wp.from_torch"):
         env.unwrapped.env.step(torch.zeros(2, 9))
-    with pytest.raises(ValueError, match="actions are not finite"):
+    with pytest.raises(ValueError, match="not finite"):
         env.step(np.full((2, 9), np.nan))
     env.close()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="after close"):

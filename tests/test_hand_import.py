@@ -380,9 +380,7 @@ def pulled(folder: Path, first: float, second: float) -> Path:
 
 def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
     path = pulled(tmp_path, 1.0, 1.0)
-    with pytest.raises(
-        HandError, match=r"tendon pull moves a1, a2 together.*say mimic: \{a2: \{joint: a1\}\}"
-    ):
+    with pytest.raises(HandError, match=r"pull .*a1, a2 together.*mimic: \{a2: \{joint: a1\}\}"):
         import_hand(path, tmp_path / "out")
     (tmp_path / "said.yaml").write_text("mimic: {a2: {joint: a1}}")
     hand = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").hand
@@ -463,7 +461,7 @@ def test_fingers_on_a_part_that_follows_each_follow_with_it(tmp_path):
     hand = done.hand
     assert done.sources == ["a1", "a2", "b1", "b2", "b3", "b4", "c", "d1", "c", "e1"]
     assert list(hand.mimic) == [-1, -1, -1, -1, -1, 4, 0, -1, 0, -1]
-    assert any("carrier carries the fingers of d1, e1" in note for note in done.notes)
+    assert any("fingers of d1, e1" in note for note in done.notes)
     model = oracle(path).compile()
     data = mujoco.MjData(model)
     base = data.body(1)
@@ -488,14 +486,14 @@ def test_fingers_on_a_part_that_follows_each_follow_with_it(tmp_path):
     assert 7 in shapes and 9 not in shapes, "what is carried collides once"
     (tmp_path / "said.yaml").write_text("hold: {c: 0.1}")
     warnings = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").warnings
-    assert any("c follows a1 in the file, and is held" in warning for warning in warnings)
+    assert any("c follows a1" in warning for warning in warnings)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("collada") is not None, reason="pycollada is there")
 def test_a_mesh_that_needs_another_package_says_which(tmp_path):
     (tmp_path / "knob.dae").write_text("<COLLADA/>")
     path = write_urdf(tmp_path, replaced("knob.stl", "knob.dae"))
-    with pytest.raises(HandError, match=r"pip install pycollada.*COLLADA \(\.dae\).*OBJ or STL"):
+    with pytest.raises(HandError, match=r"pip install pycollada"):
         import_hand(path, tmp_path / "out")
 
 
@@ -504,9 +502,7 @@ def test_a_hand_that_policies_know_by_another_name_is_told_how_to_get_it(tmp_pat
     path.write_text(path.read_text().replace('robot name="toy"', 'robot name="leap_right"'))
     done = import_hand(path, tmp_path / "out")
     assert done.hand.name == "leap_right"
-    assert any(
-        "know this hand as leap" in text and "--describe leap" in text for text in done.warnings
-    )
+    assert any("hand as leap" in text and "--describe leap" in text for text in done.warnings)
 
 
 def test_what_is_seldom_meant_or_left_out_is_said(tmp_path):
@@ -530,8 +526,7 @@ def test_what_is_seldom_meant_or_left_out_is_said(tmp_path):
     assert not any("replaces" in text for text in done.warnings)
     other = write_urdf(tmp_path).rename(tmp_path / "left.urdf")
     assert any(
-        "toy was imported from toy.urdf" in text
-        for text in import_hand(other, tmp_path / "out").warnings
+        "imported from toy.urdf" in text for text in import_hand(other, tmp_path / "out").warnings
     )
 
 
@@ -559,8 +554,8 @@ def test_command_imports_into_the_cache_and_draws_a_sheet(tmp_path, monkeypatch,
     monkeypatch.setattr(sys, "argv", ["vd-assets", "hand", "import", str(write_urdf(tmp_path))])
     assert cli.main() == 0
     said = capsys.readouterr().out
-    assert "guess: starts as a bowl" in said
-    assert "guess: the palm looks along" in said and "f1_j4  b4" in said and "0.8 x f1_j3" in said
+    assert "guess: starts as" in said
+    assert "palm looks along" in said and "f1_j4  b4" in said and "0.8 x f1_j3" in said
     hand = load_hand("toy")
     assert hand.path == tmp_path / "cache" / "hands" / "toy" / "toy.usda" and hand.num_joints == 6
     from PIL import Image
@@ -568,7 +563,7 @@ def test_command_imports_into_the_cache_and_draws_a_sheet(tmp_path, monkeypatch,
     image = np.asarray(Image.open(hand.path.with_suffix(".png")).convert("RGB"), dtype=float)
     assert (np.ptp(image, axis=2) > 40).mean() > 0.01, "links are coloured"
     monkeypatch.setattr(sys, "argv", ["vd-assets", "hand", "import", str(tmp_path / "knob.stl")])
-    assert cli.main() == 1 and "neither a URDF nor an MJCF" in capsys.readouterr().err
+    assert cli.main() == 1 and "URDF nor an MJCF" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"'claw'.*import one"):
         load_hand("claw")
 
@@ -694,9 +689,9 @@ def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
     q = env.sim.joint_q.numpy()
     assert np.isfinite(env.observation.numpy()).all()
     np.testing.assert_allclose(q[:, 5], 0.8 * q[:, 4] + 0.05, atol=0.01)
-    with pytest.raises(ValueError, match=r"joints of toy follow others.*observation.view"):
+    with pytest.raises(ValueError, match=r"toy follow others.*observation.view"):
         ReorientEnv(replace(cfg, observation=ObservationCfg(view="goal")), "cpu")
-    with pytest.raises(ValueError, match=r"toy looks up, so there is no table.*table.away_share"):
+    with pytest.raises(ValueError, match=r"toy looks up.*table.away_share"):
         ReorientEnv(replace(cfg, table=TableCfg(away_share=0.5)), "cpu")
 
 

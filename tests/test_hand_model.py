@@ -86,7 +86,7 @@ def test_kinematics_of_a_batch(hand: HandModel) -> None:
     poses = hand.forward_kinematics(q)
     assert poses.shape == (2, 3, len(hand.link_names), 7)
     np.testing.assert_allclose(poses[1, 2], hand.forward_kinematics(q[1, 2]), atol=1e-12)
-    with pytest.raises(ValueError, match="last axis must be"):
+    with pytest.raises(ValueError, match="last axis"):
         hand.forward_kinematics(np.zeros(hand.num_joints + 1))
 
 
@@ -108,9 +108,8 @@ def test_surface_samples_lie_on_the_drawn_surface_and_cover_it(hand: HandModel) 
         motor = name.endswith("motor")
         assert hand.link_names[link] == ("base" if motor else name)
         mesh = drawn(hand, "base" if motor else name, name if motor else "")
-        corners = 1e3 * np.tile(
-            mesh.triangles, (len(points), 1, 1)
-        )  # mm: trimesh's tolerances are absolute
+        # In mm: trimesh's tolerances are absolute.
+        corners = 1e3 * np.tile(mesh.triangles, (len(points), 1, 1))
         targets = 1e3 * np.repeat(points, len(mesh.faces), axis=0).astype(float)
         distance = np.linalg.norm(
             trimesh.triangles.closest_point(corners, targets) - targets, axis=1
@@ -337,11 +336,11 @@ def test_without_a_camera_one_looks_at_where_objects_are_handled(
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path, four_fingers: HandModel) -> None:
-    with pytest.raises(HandError, match=r"no such file; name a hand"):
+    with pytest.raises(HandError, match=r"name a hand"):
         read_hand(tmp_path / "absent.usda")
     garbage = tmp_path / "garbage.usda"
     garbage.write_text("solid not usd\n")
-    with pytest.raises(HandError, match=r"garbage\.usda: not a USD file"):
+    with pytest.raises(HandError, match=r"garbage\.usda: not"):
         read_hand(garbage)
     with pytest.raises(HandError, match=r"'velvet'.*rigid, soft"):
         read_hand(four_fingers.path, fingertip="velvet")

@@ -104,19 +104,19 @@ def test_a_term_that_is_none_or_gives_what_cannot_be_is_named(beside_examples, m
         )
 
     for name in ("own_terms:loud", "own:quiet"):
-        with pytest.raises(ValueError, match=f"'{name}' is not found .*; name it module:function"):
+        with pytest.raises(ValueError, match=f"'{name}' .*module:function"):
             observing(name)
     env = observing("own_terms:height")
     given[0] = torch.full((2,), torch.nan)
-    with pytest.raises(ValueError, match="own_terms:height gave a value that is not finite"):
+    with pytest.raises(ValueError, match=r"own_terms:height .*not finite"):
         env.renew()
-    with pytest.raises(ValueError, match="own_terms:height gave a value that is not finite"):
+    with pytest.raises(ValueError, match=r"own_terms:height .*not finite"):
         env.check()
     given[0] = torch.zeros(2, 2)
-    with pytest.raises(ValueError, match=r"own_terms:height gave \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"own_terms:height .*\(2, 2\)"):
         env.renew()
     given.clear()
-    with pytest.raises(ValueError, match="own_terms:height raised IndexError: list index"):
+    with pytest.raises(ValueError, match=r"own_terms:height .*IndexError"):
         env.renew()
 
 
@@ -126,12 +126,10 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
         vd.read(path)
     for text in (b"", b"[]", b"\xff", b"{}", b'{"format": "visual-dexterity policies 1"}'):
         path.write_bytes(text)
-        with pytest.raises(
-            ValueError, match=f"{path} has .*format.*; give the folder of a recording or"
-        ):
+        with pytest.raises(ValueError, match=f"{path} .*format.*folder of a recording"):
             vd.read(path)
     path.write_text(f'{{"format": "{RESULT_FORMAT}"}}')
-    with pytest.raises(ValueError, match=f"{path}: Result has no .*; run vd-eval again"):
+    with pytest.raises(ValueError, match=f"{path}.*run vd-eval again"):
         vd.read(path)
     path.unlink()
     path.mkdir()
@@ -146,13 +144,11 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
     ):
         for file, written in {**good, name: text}.items():
             (path / file).write_text(written)
-        with pytest.raises(
-            ValueError, match=f"{path / name} is damaged .*; copy the whole folder again"
-        ):
+        with pytest.raises(ValueError, match=f"{path / name} is damaged .*copy the whole"):
             vd.read(path)
     path = tmp_path / "a.pt"
     torch.save(torch.nn.Linear(1, 1), path)
-    with pytest.raises(ValueError, match=r"or holds more than weights, .*; copy it again") as said:
+    with pytest.raises(ValueError, match=r"more than weights, .*again") as said:
         vd.load_policy(path, device="cpu")
     assert "weights_only" not in str(said.value)
 
@@ -172,4 +168,4 @@ def test_the_tutorials_run_logs_its_terms_and_its_policy_knows_them(
     )
     assert result.rows[0].overall.episodes == 1
     assert main(["tracker", "run", "--objects", "cube", "--out", "tracking.safetensors"]) == 1
-    assert "observes own_terms:height, which no camera shows" in capsys.readouterr().err
+    assert "own_terms:height" in capsys.readouterr().err

@@ -168,7 +168,7 @@ def test_interrupted_import_leaves_no_part_and_no_process(ending: signal.Signals
         assert child.returncode == -ending
     else:
         assert child.returncode == 128 + ending
-        assert "goes on from there" in errors
+        assert "goes on from" in errors
     deadline = time.monotonic() + 120
     while left := [pid for pid in processes if _runs(pid)]:
         assert time.monotonic() < deadline, left
@@ -202,17 +202,19 @@ def _runs(pid: int) -> bool:
         ((120.0, 80.0, 50.0), (0.12, 0.08, 0.05), "taken as mm"),
         ((2.0, 1.0, 1.0), (0.095, 0.0475, 0.0475), "taken as cm, scaled"),
         ((0.16, 0.12, 0.04), (0.13, 0.0975, 0.0325), "scaled by 0.812"),  # too wide for the fingers
+        # That is as far as its length goes.
         (
             (0.12, 0.12, 0.12),
             (0.095, 0.095, 0.095),
             "scaled by 0.792",
-        ),  # which is as far as its length goes
+        ),
         ((0.1, 0.03, 0.02), (0.125, 0.0375, 0.025), "scaled by 1.25"),  # too thin to be got hold of
+        # Which is as far as its length goes.
         (
             (0.15, 0.03, 0.02),
             (0.165, 0.033, 0.022),
             "scaled by 1.1",
-        ),  # which is as far as its length goes
+        ),
         ((0.12, 0.1, 0.02), (0.13, 0.13 / 1.2, 0.13 / 6.0), "scaled by 1.08"),  # or its width
     ],
 )
@@ -253,7 +255,7 @@ def test_a_small_hole_is_filled_and_a_large_opening_is_said():
     assert body_of(small).warnings == ()
     assert not large.closed
     sheet = body_of(large)
-    assert "open: the surface encloses nothing" in sheet.warnings[0]
+    assert "open: the surface" in sheet.warnings[0]
     # Not half a ball but its shell: of the thickness that is said, and with the inertia of that.
     said = float(sheet.warnings[0].partition("a sheet ")[2].partition(" mm")[0])
     assert 0.5 < said < 1e3 * 0.12 / 96
@@ -279,7 +281,7 @@ def test_debris_does_not_set_the_scale(tmp_path: Path):
 
 def test_two_bodies_are_refused():
     apart = l_shape().apply_translation([0.0, 0.0, 0.1])
-    with pytest.raises(m.MeshError, match=r"2 bodies apart.*50 % of the volume.*import each alone"):
+    with pytest.raises(m.MeshError, match=r"2 bodies apart.*50 %.*each alone"):
         repair_mesh(trimesh.util.concatenate([l_shape(), apart]))
 
 
@@ -349,6 +351,38 @@ def test_a_mesh_of_many_faces_is_simplified_and_its_error_said(
     assert off.max() < 1.5e-2 * said * 0.12
 
 
+IMPORT_AND_MEASURE = """
+import resource, subprocess, sys
+subprocess.run([sys.executable, "-m", "vd.assets_usd.cli", "import", *sys.argv[1:]], check=True)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss)
+"""
+"""Prints the processor time [s] and the largest resident memory [kB] of an import.
+
+A process of its own, since what it starts would begin with the memory of the tests.
+"""
+
+
+@pytest.mark.slow
+def test_a_scan_takes_no_more_time_and_memory_than_two_million_faces_may(tmp_path: Path):
+    """They may take a minute of two cores and 2 GB; a sixth of their faces takes half of that."""
+    scan = trimesh.creation.icosphere(subdivisions=7, radius=0.06)
+    scan.vertices[:, :2] *= 0.8 + 0.3 * np.cos(70.0 * scan.vertices[:, 2:])
+    scan.export(tmp_path / "vase.stl")
+    command = [sys.executable, "-c", IMPORT_AND_MEASURE, str(tmp_path / "vase.stl")]
+    run = subprocess.run(
+        [*command, "--out", str(tmp_path / "out"), "--jobs", "1"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    processor_s, memory_kb = map(float, run.stdout.split()[-2:])
+    assert len(scan.faces) == 327_680
+    assert processor_s < 60.0
+    assert memory_kb < 1e6
+    assert read_object(tmp_path / "out" / "vase.usd").warnings == ()
+
+
 def with_antenna(closed: bool = True) -> trimesh.Trimesh:
     """A box of three different sides, and off its middle a rod 2 mm thick and 30 mm long."""
     body = trimesh.creation.box((0.12, 0.06, 0.03))
@@ -367,7 +401,7 @@ def test_a_thin_part_that_touches_is_of_the_object(closed: bool, tmp_path: Path)
     model = import_mesh(job, replace(FAST, units="m", keep_size=True)).model
     np.testing.assert_allclose(np.ptp(model.vertices, axis=0), [0.12, 0.06, 0.0599], atol=1e-4)
     (warning,) = model.warnings
-    assert "something thin, 30 mm long, does not collide" in warning
+    assert "30 mm long" in warning
     # A box alone is the same after half a turn about each axis.
     assert len(symmetries([model], "cpu")[0]) == 1
 
@@ -385,7 +419,7 @@ def test_what_is_left_out_and_long_is_a_warning():
 def test_parts_that_are_far_off_come_with_advice():
     parts = d.Decomposition((), "coacd", error=2.32)
     (warning,) = importer._parts_warnings(parts, 0.001)
-    assert "232 % of its volume: thicken its walls, or allow finer parts (--threshold" in warning
+    assert "232 %" in warning and "--threshold" in warning
 
 
 def stuck(*_: object) -> list[np.ndarray]:
@@ -411,7 +445,7 @@ def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest
     monkeypatch.setattr(d, "_coacd_parts", stuck)
     result = d.decompose(mesh, limits)
     assert result.method == "one hull" and len(result.hulls) == 1
-    assert "no result after 1 s of processor time" in result.fallback[0]
+    assert "1 s of processor time" in result.fallback[0]
     assert hull_depth(result.hulls[0], mesh.vertices).max() < 1e-9
     monkeypatch.setattr(d, "_coacd_parts", waiting)
     assert d.decompose(mesh, limits).fallback == ()
@@ -425,7 +459,7 @@ def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.
         patch.setattr(d, "_coacd_parts", crashing)
         fallen = import_mesh(job, settings).model
     assert len(fallen.hulls) == 1 and "or it crashed" in fallen.warnings[0]
-    assert "fall-back, tried again at the next import" in fallen.warnings[0]
+    assert "tried again" in fallen.warnings[0]
     # The hull of the L without the L: a triangle of half 9 x 5 cm.
     assert fallen.volume_error == pytest.approx(0.5 * 0.09 * 0.05 * 0.03 / L_VOLUME, rel=0.05)
     assert read_object(Path(job.target)).warnings == fallen.warnings

@@ -42,7 +42,7 @@ def test_meshes_are_found_once_and_in_order(tmp_path: Path):
         (tmp_path / name).write_text("x")
     found = find_meshes([tmp_path / "b", tmp_path, tmp_path / "a" / "a.STL"])
     assert [p.name for p in found] == ["a.obj", "A.ply", "a.STL"]
-    with pytest.raises(m.MeshError, match="no such file or folder"):
+    with pytest.raises(m.MeshError, match="no such file"):
         find_meshes([tmp_path / "nowhere"])
     (tmp_path / "none").mkdir()
     with pytest.raises(m.MeshError, match="no mesh in"):
@@ -97,7 +97,7 @@ def test_what_fails_in_its_process_is_refused_with_a_remedy(
     monkeypatch.setattr(importer, "run_tasks", run_tasks)
     (result,) = import_meshes([brick(tmp_path / "mug.stl")], tmp_path / "out")
     assert result.status == "refused"
-    assert "died: out of memory, or killed; export it again with fewer faces" in result.reason
+    assert "out of memory" in result.reason
 
 
 @pytest.mark.parametrize("place", ["cube", "cache/objects/cuboid", "procedural-7-seed3"])
@@ -117,9 +117,7 @@ def test_a_name_that_means_a_folder_here_and_a_set_is_refused(
     there = tmp_path / "cache" / "objects" / "things"
     import_meshes([brick(tmp_path / "here.stl")], tmp_path / "things")
     import_meshes([brick(tmp_path / "there.stl")], there)
-    with pytest.raises(
-        ObjectError, match=rf"both a folder here and a set; write \./things, or {there}"
-    ):
+    with pytest.raises(ObjectError, match=rf"write \./things, or {there}"):
         load_set("things")
     assert [item.name for item in load_set("./things")] == ["here"]
     assert [item.name for item in load_set(str(there))] == ["there"]
@@ -138,7 +136,7 @@ def test_objects_fit_the_hand_that_is_named(in_process: None, tmp_path: Path):
     assert long.longest_side == pytest.approx(0.09, rel=1e-3)
     # Of a D'Claw 0.13 m at 0.165 m.
     assert m.mean_width(wide.vertices) == pytest.approx(0.13 * 0.09 / 0.165, rel=1e-3)
-    with pytest.raises(ValueError, match="no hand is called 'claw'"):
+    with pytest.raises(ValueError, match="'claw'"):
         import_meshes(meshes, tmp_path / "other", ImportSettings(hand="claw"))
 
 
@@ -173,9 +171,7 @@ def test_what_is_no_object_of_ours_is_never_written_over(text: str, tmp_path: Pa
     mine = tmp_path / "out" / "mug.usd"
     mine.parent.mkdir()
     mine.write_text(text)
-    with pytest.raises(
-        m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*remove it.*--out"
-    ):
+    with pytest.raises(m.MeshError, match=r"mug\.usd .*remove it.*--out"):
         import_meshes([mesh], mine.parent)
     assert mine.read_text() == text
 
@@ -199,7 +195,7 @@ def test_a_default_set_has_the_objects_of_one_folder(
     assert all(word in str(error.value) for word in (str(out), str(kits[0]), "--out"))
     for path in ("cube.stl", "procedural-7-seed3/a.stl"):
         reserved = brick(tmp_path / path)
-        with pytest.raises(ObjectError, match=r"built-in object set.*say where with --out"):
+        with pytest.raises(ObjectError, match=r"built-in .*--out"):
             default_set([reserved if path == "cube.stl" else reserved.parent])
 
 
@@ -261,6 +257,6 @@ def test_a_real_size_needs_a_unit_and_a_mass_a_material(in_process: None, tmp_pa
     (kept,) = import_meshes([brick(tmp_path / "x.glb")], tmp_path / "out", settings)
     assert kept.model.scale == 1.0
     nut = 0.012 * 0.012 * 0.005
-    assert "give --density or --mass" in m.mass_of(ImportSettings(), nut)[2][0]
+    assert "--density or --mass" in m.mass_of(ImportSettings(), nut)[2][0]
     with pytest.raises(m.MeshError, match="--mass is in kg"):
         m.mass_of(ImportSettings(mass=5.0), nut)

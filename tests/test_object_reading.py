@@ -152,7 +152,7 @@ def test_a_usd_made_elsewhere_is_read_as_it_is_composed(mug: Path, tmp_path: Pat
 
 def test_usd_that_is_not_all_there_or_not_read_is_refused(mug: Path, tmp_path: Path) -> None:
     ours = write_object(tmp_path / "ours" / "cube.usd", procedural.cube())
-    with pytest.raises(MeshError, match="an object of vd-assets already"):
+    with pytest.raises(MeshError, match="vd-assets already"):
         load_mesh(ours)
     with pytest.raises(MeshError, match="no mesh in"):
         find_meshes([ours.parent])
@@ -163,9 +163,7 @@ def test_usd_that_is_not_all_there_or_not_read_is_refused(mug: Path, tmp_path: P
     for kind in (UsdGeom.PointInstancer, UsdGeom.Cube):
         name = kind.Define(stage, "/many").GetPrim().GetTypeName()
         stage.Save()
-        with pytest.raises(
-            MeshError, match=f"/many is a {name}, which is not read; make it a mesh"
-        ):
+        with pytest.raises(MeshError, match=f"/many is a {name}.*make it a mesh"):
             load_mesh(tmp_path / "many.usda")
 
 

@@ -74,7 +74,7 @@ def test_an_object_is_known_by_its_scan(device):
         assert np.median(away) < 0.003
     of = {"world_object": np.arange(2), "world_scale": np.ones(2), "library": library_on(device)}
     found = Registration(known, **of, camera=None, device=device)
-    assert (found._shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
+    assert (found.shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
     assert [len(turns) for turns in symmetries(known, device)] == [1] * 2, (
         "noise makes nothing symmetric"
     )
@@ -91,9 +91,8 @@ def test_a_scan_is_noisy_and_misses_one_side():
     assert first.max() < 0.3 * RADIUS_M, (
         "in no order: a network takes the first points for the whole"
     )
-    off = (
-        np.linalg.norm(scanned, axis=1) - RADIUS_M
-    )  # across the surface only one axis of the noise shows
+    # Across the surface only one axis of the noise shows.
+    off = np.linalg.norm(scanned, axis=1) - RADIUS_M
     assert off.std() == pytest.approx(NOISE_M, rel=0.1)
     side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))
     # A cap with a fifth of a sphere's area begins at 0.6 of its radius.

@@ -20,10 +20,11 @@ from vd.train.cli import main
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
+# The network of vision policies, beside no critic.
 MAX_POLICY_BYTES, ALIGNMENT_BYTES = (
     3 * 2**20,
     2**20,
-)  # the network of vision policies, beside no critic
+)
 
 
 def installed_names() -> set[str]:

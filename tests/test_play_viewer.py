@@ -121,7 +121,7 @@ def test_controls_reach_the_simulation(player):
     use(player, "New goal")
     assert not np.allclose(session.snapshot.goal_quat, goal)
     use(player, "Object", "stick")
-    assert session.object_name == "stick" and "stick" in player._status.content
+    assert session.object_name == "stick" and "stick" in player.status.content
     use(player, "Reset")
     assert session.snapshot.time_s == 0.0
 
@@ -129,7 +129,7 @@ def test_controls_reach_the_simulation(player):
 def test_what_a_policys_camera_sees_is_shown():
     player = PlayViewer(session(Sees(), "dclaw4"), verbose=False)
     player.run(steps=1)
-    assert "believed 0.25" in player._status.content and "ms" in player._status.content
+    assert "believed 0.25" in player.status.content and "ms" in player.status.content
     seen, camera = player.session.view(), player.session.hand.camera
     player.close()
     assert seen.shape == (camera.height, camera.width, 3)

@@ -102,7 +102,7 @@ def test_every_flipped_byte_is_noticed(path):
         data = bytearray(whole)
         data[place] ^= 1
         path.write_bytes(data)
-        with pytest.raises(ContractError, match=rf"{path} is damaged.*copy it again"):
+        with pytest.raises(ContractError, match=rf"{path} is damaged"):
             read_policy(path)
     for data in (b"", whole[:100], whole[:-1], whole + b"\n"):
         path.write_bytes(data)
@@ -121,13 +121,13 @@ def test_every_flipped_byte_is_noticed(path):
 )
 def test_what_this_version_does_not_know_is_refused_by_file_and_field(path, change, message):
     edit(path, change)
-    with pytest.raises(ContractError, match=f"{path}: {message}.*; take the version that wrote it"):
+    with pytest.raises(ContractError, match=f"{path}: {message}.*take the version"):
         read_policy(path)
 
 
 def test_weights_that_are_others_are_refused(path):
     edit(path, lambda _: None, lambda tensors: tensors["actor.mlp.0.bias"].add_(0.1))
-    with pytest.raises(ContractError, match=r"outputs differ by .* from the golden ones"):
+    with pytest.raises(ContractError, match=r"outputs differ by .*golden"):
         read_policy(path)
     edit(path, lambda _: None, lambda tensors: tensors.pop("actor.mlp.0.bias"))
     with pytest.raises(ContractError, match=r'Missing key.* "0\.bias"'):
@@ -189,16 +189,14 @@ def test_an_evaluation_refuses_a_hand_that_changed_under_its_name(tmp_path, caps
     before = next(line for line in text.splitlines() if "vd:workspace:drop" in line)
     moved.write_text(text.replace(before, before.partition("=")[0] + "= (0, 0, 0.2)"))
     assert evaluate(["dclaw4", "--hand", str(moved), "--device", "cpu"]) == 1
-    assert "hand.drop_m[2] is 0.2 here, but 0.12 in the policy's" in capsys.readouterr().err
+    assert "hand.drop_m[2] is 0.2 here, but 0.12" in capsys.readouterr().err
 
 
 def test_another_camera_is_refused_unless_the_policy_has_its_own(hand):
     place = hand.camera.position + np.array([0.0, 0.0, 0.02])
     moved = replace(hand, mounted_camera=replace(hand.camera, position=place))
     assert made().interface == read_contract(SHIPPED_POLICIES["dclaw3-tracking"]).interface
-    with pytest.raises(
-        ContractError, match=r"camera\.pose_in_base\[2\] is .*write it for this one"
-    ):
+    with pytest.raises(ContractError, match=r"camera\.pose_in_base\[2\] is .*this one"):
         check_hand(made(), moved, "it")
     check_hand(made(PLACED), moved, "it")
     with pytest.raises(ContractError, match=r"camera\.fx is .* here"):
@@ -225,9 +223,9 @@ assert not loaded, loaded
 def test_names_of_outputs_say_what_is_written(tmp_path, capsys, monkeypatch):
     for name in ("out.pt", "out", "out.onnx.bak"):
         assert train(["export", "dclaw4-cube", str(tmp_path / name)]) == 1
-        assert "has to end in .safetensors or .onnx" in capsys.readouterr().err
+        assert ".safetensors or .onnx" in capsys.readouterr().err
     tracker = ["tracker", "dclaw3", "--objects", "cube", "--out", str(tmp_path / "tracking.pt")]
-    assert train(tracker) == 1 and "has to end in .safetensors" in capsys.readouterr().err
+    assert train(tracker) == 1 and "in .safetensors" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
     written = []
     monkeypatch.setattr("vd.train.export.export_onnx", lambda policy, *_: written.append(policy))

@@ -33,7 +33,7 @@ def test_a_pulled_policy_has_a_name_and_nothing_takes_its_place_unasked(place, c
     push = ["push", "dclaw4", "--at", str(place), "--name"]
     assert main(pull) == main(pull) == main(["list", "--at", str(place)]) == 0
     assert find_policy("mine") == pulled_folder() / "mine.safetensors"
-    line = r"^mine +teacher +dclaw4 +0\.5 MB  installed$"
+    line = r"^mine +teacher +dclaw4 +0\.5 MB  cube, 0\.95 to 1\.05 times"
     assert re.search(line, capsys.readouterr().out, re.MULTILINE)
 
     assert "another policy" in refused(capsys, *push, "mine")
@@ -50,8 +50,8 @@ def test_what_is_damaged_or_has_no_name_is_refused(place, tmp_path, capsys):
     at = ("--at", str(place))
     (place / "mine.safetensors").write_bytes(CUBE[:300_000])
     assert "is damaged" in said("pull", "mine", *at) and not pulled_folder().exists()
-    assert "has no policy yours; it has mine" in said("pull", "yours", *at)
-    assert "has no policy ../mine" in said("pull", "../mine", *at)
+    assert "yours; it has mine" in said("pull", "yours", *at)
+    assert "policy ../mine" in said("pull", "../mine", *at)
     assert "--name says how" in said("push", str(place / "mine.safetensors"), *at)
     assert "at its end" in said("push", "dclaw4", *at, "--name", "yours.safetensors")
     assert "no such folder" in said("list", "--at", str(tmp_path / "nowhere"))

@@ -17,9 +17,11 @@ from vd.deploy.loop.run_page import PAGE_FILE, goal_results, revolutions
 from vd.envs.cfg import ObservationCfg, RewardCfg, SpinCfg, StartCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli as evaluate
+from vd.evaluate import compare
 from vd.evaluate.spin import SPIN_FILE, turn
 from vd.logs.hand_log import read_log
 from vd.policy.agents import open_policy, task_for
+from vd.train import cli as train
 from vd.train.presets import PRESETS, smoke
 from vd.train.teacher import build_teacher
 
@@ -109,9 +111,16 @@ def test_turns_are_counted_to_the_drop_or_the_end(policy):
     np.testing.assert_allclose(angle[0, :2], [12 * 0.2, -12 * 0.1], atol=0.4)
 
 
-def test_it_is_judged_by_its_turns_and_not_beside_policies_with_goals(policy, tmp_path, capsys):
+def test_it_is_judged_by_its_turns_and_is_no_policy_with_goals(
+    policy, tmp_path, capsys, monkeypatch
+):
+    opened = []
+    monkeypatch.setattr(
+        compare, "open_policy", lambda *agent: opened.append(agent[0]) or open_policy(*agent)
+    )
     flags = ["--objects", "cube", "--episodes", "2", "--episode-s", "0.5", "--device", "cpu"]
     assert evaluate.main([policy, "zero", *flags, "--out", str(tmp_path)]) == 0
+    assert opened == [policy, "zero"], "each once"
     found = json.loads((tmp_path / SPIN_FILE).read_text())
     assert [row["object"] for row in found["rows"]] == ["cube", "cube"]
     assert all(0.0 < row["held_s"] <= 0.5 and row["episodes"] == 2 for row in found["rows"])
@@ -119,6 +128,8 @@ def test_it_is_judged_by_its_turns_and_not_beside_policies_with_goals(policy, tm
     for more, why in (([policy, "--consecutive"], "no goals"), ([policy, "dclaw3"], "to goals")):
         assert evaluate.main([*more, *flags, "--out", str(tmp_path)]) == 1
         assert why in capsys.readouterr().err
+    assert train.main(["tracker", policy, "--objects", "cube", "--device", "cpu"]) == 1
+    assert f"{policy} turns objects" in capsys.readouterr().err
 
 
 def test_revolutions_are_about_the_axis_however_often_it_goes_round():

@@ -72,9 +72,9 @@ def test_a_small_tolerance_has_a_small_bound_and_nothing_to_calibrate_on_is_an_e
     near = calibrate(*episodes(7, noise=0.03), tolerance_rad=0.1)
     assert near.rule.distance_rad < 0.1 and near.success > 0.0
     predicted, norm, true, steps = episodes(5)
-    with pytest.raises(ValueError, match="no episode has a step"):
+    with pytest.raises(ValueError, match="no episode"):
         calibrate(predicted, norm, true, np.ones_like(steps))
-    with pytest.raises(ValueError, match="no rule stops any of 60 episodes"):
+    with pytest.raises(ValueError, match="any of 60 episodes"):
         calibrate(predicted, norm, true + 2.0, steps)
 
 

@@ -74,8 +74,8 @@ def test_areas_of_a_box_and_a_sphere():
 
 
 def test_no_point_of_a_union_lies_in_another_body(monkeypatch):
-    bodies, samples, number = shapes._parts(30, CPU)
-    monkeypatch.setattr(shapes, "_parts", lambda count, device: (bodies, samples[:], number))
+    bodies, samples, number = shapes.draw_parts(30, CPU)
+    monkeypatch.setattr(shapes, "draw_parts", lambda count, device: (bodies, samples[:], number))
     monkeypatch.setattr(shapes, "HOLLOWS", 0.0)
     made = shapes.unions(30, 500, CPU)
     assert made.isfinite().all()
@@ -88,8 +88,8 @@ def test_no_point_of_a_union_lies_in_another_body(monkeypatch):
 def test_a_hollow_opens_the_first_body(monkeypatch):
     monkeypatch.setattr(shapes, "HOLLOWS", 1.0)
     monkeypatch.setattr(shapes, "BODIES", 1)
-    bodies, samples, number = shapes._parts(40, CPU)
-    monkeypatch.setattr(shapes, "_parts", lambda count, device: (bodies, samples[:], number))
+    bodies, samples, number = shapes.draw_parts(40, CPU)
+    monkeypatch.setattr(shapes, "draw_parts", lambda count, device: (bodies, samples[:], number))
     made = shapes.unions(40, 500, CPU)
     level = bodies[0].level(made[..., :3])
     inside = (level < -1e-3).float().mean(dim=1)

@@ -71,7 +71,7 @@ def test_every_stage_learns_what_it_is_shown(stage, tmp_path):
     for name in names & figures.keys():
         assert figures[name] < first[name], name
     assert figures["loss/flow"] < first["loss/flow"] - 0.5  # a likelihood half as large again
-    trainer._close()
+    trainer.close()
 
 
 @pytest.mark.parametrize("stage", [1, 2])
@@ -85,7 +85,7 @@ def test_what_is_made_again_is_what_was_done(stage, tmp_path):
     acting = trainer.acting
     trainer.network.eval()
     if stage == 1:  # the same points of each surface in both
-        source._shapes = source._shapes[:, :200]
+        source.shapes = source.shapes[:, :200]
     said = []
     decide = acting.decide
     acting.decide = lambda sight: said.append(decide(sight)) or said[-1]
@@ -109,7 +109,7 @@ def test_what_is_made_again_is_what_was_done(stage, tmp_path):
         torch.testing.assert_close(belief.rotation, turn, atol=1e-4, rtol=1e-3)
     if stage == 2:
         assert source.blank.any() or torch.isnan(sequences.sight.camera).all(-1).all(-1).any()
-    trainer._close()
+    trainer.close()
 
 
 def test_truth_is_where_the_objects_points_are(tmp_path):
@@ -123,7 +123,7 @@ def test_truth_is_where_the_objects_points_are(tmp_path):
     assert apart[0] < 0.008  # two clouds of 200 points of one surface
     assert apart[1] > 1.5 * apart[0]
     assert float(sequences.label.abs().max()) <= 1.0
-    trainer._close()
+    trainer.close()
 
 
 @pytest.mark.parametrize("stage", [0, 1])
@@ -136,7 +136,7 @@ def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
     assert turn.max() < made.AWAY_RAD + 1e-3
     assert turn.mean() == pytest.approx(0.5 * made.AWAY_RAD, abs=0.2)  # four deviations
     assert shift.max() < np.sqrt(3.0) * made.AWAY_M + 1e-6
-    trainer._close()
+    trainer.close()
 
 
 def test_losses_are_least_at_the_truth(tmp_path):
@@ -171,15 +171,15 @@ def test_losses_are_least_at_the_truth(tmp_path):
 def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(stage, tmp_path):
     whole = trainer_of(settings(stage, tmp_path / "whole"))
     whole.learn(3)
-    whole._close()
+    whole.close()
     part = trainer_of(settings(stage, tmp_path / "part"))
     part.learn(2)
-    part._close()
+    part.close()
     checkpoint = list_checkpoints(tmp_path / "part")[-1]
     again = trainer_of(replace(settings(stage, tmp_path / "part"), resume=str(checkpoint)))
     assert again.iteration == 2
     again.learn(1)
-    again._close()
+    again.close()
     if stage == 0:
         torch.testing.assert_close(weights(again), weights(whole), atol=0.0, rtol=0.0)
     else:
@@ -192,7 +192,7 @@ def policy(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("student")
     trainer = trainer_of(settings(1, folder))
     trainer.learn(1)
-    trainer._close()
+    trainer.close()
     return folder / "policy.safetensors"
 
 

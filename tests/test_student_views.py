@@ -70,9 +70,8 @@ def test_what_is_before_hides_what_is_behind(hands, monkeypatch):
     empty(hands, monkeypatch)
     row = torch.zeros(1, dtype=torch.long)
     shown = visible(hands, row, plates(hands, 0.05))[0]
-    assert (
-        shown[:400].all() and shown[400:].float().mean() < 0.15
-    )  # perspective lets its rim be seen
+    # Perspective lets its rim be seen.
+    assert shown[:400].all() and shown[400:].float().mean() < 0.15
     turned = plates(hands, 0.05) * torch.tensor([1.0, 1, 1, -1, -1, -1])
     assert not visible(hands, row, turned)[0].any(), "a surface shows its outside alone"
 

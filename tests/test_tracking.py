@@ -292,7 +292,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
         target = actions.goal(action[0].numpy(), sensed.joint_q)
         env.step(wp.from_torch(action.contiguous()))
         np.testing.assert_allclose(target, env.sim.target.numpy()[0, : env.num_actions], atol=1e-6)
-    with pytest.raises(ValueError, match="there is no image"):
+    with pytest.raises(ValueError, match="no image"):
         runner.decide(sensed)
 
 

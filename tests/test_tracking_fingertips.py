@@ -57,5 +57,5 @@ def test_a_finger_that_is_no_chain_is_refused():
     hand = hand_named("dclaw3")
     parents = hand.joint_parent.copy()
     parents[2] = 0
-    with pytest.raises(ValueError, match="finger 0 of dclaw3 are no chain"):
+    with pytest.raises(ValueError, match="finger 0 of dclaw3"):
         Fingertips(replace(hand, joint_parent=parents), torch.tensor)

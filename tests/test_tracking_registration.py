@@ -75,7 +75,7 @@ def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):
         cube, surface_points=cube.surface_points + rng.normal(scale=0.004, size=(500, 3))
     )
     for item in (cube, simpler, scan):
-        shapes = registration(item, 1, device)._shapes
+        shapes = registration(item, 1, device).shapes
         half, grid = float(shapes.half.numpy()[0]), shapes.distance.numpy()[0]
         place = np.stack(
             np.meshgrid(*3 * [np.linspace(-half, half, len(grid))], indexing="ij"), axis=-1

@@ -24,9 +24,7 @@ def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monke
     if preset.env.hand in HANDS:
         assert parse_teacher(["--preset", name]) == preset
     else:
-        with pytest.raises(
-            ValueError, match=f"no hand is called '{preset.env.hand}'.*--describe {preset.env.hand}"
-        ):
+        with pytest.raises(ValueError, match=f"'{preset.env.hand}'.*--describe {preset.env.hand}"):
             parse_teacher(["--preset", name])
         flags = ["--preset", name, "--hand", "dclaw3"]
         assert parse_teacher(flags).env == dataclasses.replace(preset.env, hand="dclaw3")
@@ -118,9 +116,7 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
     assert cfg.run.out == Path("runs/x") and cfg.run.max_minutes == 2.5
     assert cfg.policy == PRESETS["gpu"]().policy
-    with pytest.raises(
-        ValueError, match=r"--env\.randomisation\.force-s draws nothing; add --randomise"
-    ):
+    with pytest.raises(ValueError, match=r"--env\.randomisation\.force-s .*--randomise"):
         parse_teacher(["--preset", "cpu-demo", "--env.randomisation.force-s", "0.1"])
 
 
@@ -151,12 +147,12 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     assert parse_teacher([*auto, str(tmp_path)]).run.save_every == 17
     assert parse_teacher([*auto, str(tmp_path / "new")]).ppo == PRESETS["gpu"]().ppo
     assert parse_teacher(["--smoke", "--resume", "auto", "--out", str(tmp_path / "new")]).smoke
-    with pytest.raises(ValueError, match="--preset multi-gpu is none; one of paper, "):
+    with pytest.raises(ValueError, match=r"--preset multi-gpu .*paper, "):
         parse_teacher(["--preset", "multi-gpu"])
     with pytest.raises(FileNotFoundError, match="--out"):
         parse_teacher(["--out", str(tmp_path / "none"), "--resume"])
     (tmp_path / "config.json").write_text('{"ppo": {"epoch": 3}}')
-    with pytest.raises(ValueError, match=r"ppo has no field epoch"):
+    with pytest.raises(ValueError, match=r"no field epoch"):
         parse_teacher(["--out", str(tmp_path), "--resume"])
 
 
@@ -196,4 +192,4 @@ def test_export_commands(tmp_path, capsys):
     resumed.load(str(small))
     assert resumed.iteration == 1 and resumed.new_episodes
     assert main(["export", "--resumable", str(out), str(small)]) == 1
-    assert "which nothing can resume" in capsys.readouterr().err
+    assert "nothing can resume" in capsys.readouterr().err

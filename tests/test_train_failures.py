@@ -36,7 +36,7 @@ def test_what_weighs_nothing_teaches_nothing(tmp_path):
         alg = runner.alg
         alg.weights = torch.zeros(16)
         alg.weights[:8] = 2.0 if kept.stop is None else 1.0
-        alg._take_samples()
+        alg.take_samples()
         rows = torch.arange(len(alg.samples["weights"])).view(-1, 16)[:, kept].flatten()
         alg._rows = rows
         alg.entropy_coef = alg.bound_coef = 0.0

@@ -165,16 +165,12 @@ def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
         def _observe(self) -> None: ...
 
     runner = make_runner(tmp_path / "hand", env=Larger(num_envs=4), policy=NORMALISING)
-    with pytest.raises(
-        ValueError, match="moves 2 joints of dummy, and this run's hand, dummy, has 3"
-    ):
+    with pytest.raises(ValueError, match=r"2 joints of dummy.* 3"):
         runner.begin_from(str(path))
     make_runner(tmp_path / "more", env=Seeing(num_envs=16), policy=NORMALISING).learn(1)
     path = tmp_path / "more" / "policy.safetensors"
     runner = make_runner(tmp_path / "less", policy=NORMALISING)
-    with pytest.raises(
-        ValueError, match=r"reads 7 values and this run observes 5: give.*leave --preset out"
-    ):
+    with pytest.raises(ValueError, match=r"7 values .* 5: .*--preset"):
         runner.begin_from(str(path))
 
 
@@ -214,9 +210,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     make_runner(tmp_path).learn(1)
     assert find_start(str(tmp_path)) == tmp_path / "checkpoints" / BEST_NAME, "it has the optimiser"
     assert find_start(str(tmp_path / "policy.safetensors")) == tmp_path / "policy.safetensors"
-    with pytest.raises(
-        FileNotFoundError, match=r"--init: no policy at .*installed policy: .*dclaw3"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"--init: .*dclaw3"):
         find_start(str(tmp_path / "none"))
     start = [
         "--preset",
@@ -229,13 +223,13 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     cfg = parse_teacher([*start, "--out", str(tmp_path / "run"), "--resume", "auto"])
     assert cfg.env.observation.shape == "full" and cfg.ppo == PRESETS["gpu"]().ppo
     assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
-    assert "--init: no policy at" in capsys.readouterr().err
+    assert "--init: no policy" in capsys.readouterr().err
     assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
-    assert "sees by camera; give its teacher, dclaw3" in capsys.readouterr().err
+    assert "teacher, dclaw3" in capsys.readouterr().err
     assert (
         main(["teacher", "--init-levels", "1", "0", "1", "1", "--out", str(tmp_path / "run")]) == 1
     )
-    assert "--init-levels says where a run with --init begins" in capsys.readouterr().err
+    assert "--init-levels says" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
@@ -261,5 +255,5 @@ def test_without_a_preset_the_learner_is_the_policys_if_it_says(tmp_path):
     cfg = parse_teacher(["--init", str(path)])
     assert cfg.ppo == LEARNED and cfg.policy == NORMALISING and cfg.env == PRESETS["gpu"]().env
     _changed(path, learner={"ppo": {"wind": 3.0}, "policy": {}})
-    with pytest.raises(ValueError, match=r"learner.ppo has no field wind.*add --preset"):
+    with pytest.raises(ValueError, match=r"no field wind.*--preset"):
         parse_teacher(["--init", str(path)])

@@ -74,13 +74,13 @@ def test_an_update_that_runs_away_ends_with_its_epoch(tmp_path):
             SMALL_PPO, schedule=schedule, epochs=4, desired_kl=0.01, actor_learning_rate=0.05
         )
         runner = make_runner(tmp_path / schedule, ppo=ppo)
-        step, kls[schedule] = runner.alg._minibatch_step, []
+        step, kls[schedule] = runner.alg.minibatch_step, []
 
         def kept(rows, step=step, kls=kls[schedule]):
             kls.append(step(rows))
             return kls[-1]
 
-        runner.alg._minibatch_step = kept
+        runner.alg.minibatch_step = kept
         runner.learn(1)
         row = read_progress(tmp_path / schedule / "progress.jsonl")[-1]
         kls[schedule] = [float(statistics[3]) for statistics in kls[schedule]]
@@ -202,7 +202,7 @@ def _after_a_rollout(runner):
             observation, reward, done, extras = runner.env.step(runner.alg.act(observation))
             runner.alg.process_env_step(observation, reward, done, extras)
         runner.alg.compute_returns(observation)
-    runner.alg._take_samples()
+    runner.alg.take_samples()
     return runner
 
 
@@ -249,7 +249,7 @@ def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
     ):
         for alg in (plain, recorded):
             alg.actor.distribution.set_floor(0.1)
-        statistics = [alg._minibatch_step(rows) for alg in (plain, recorded)]
+        statistics = [alg.minibatch_step(rows) for alg in (plain, recorded)]
         assert torch.allclose(*statistics, rtol=1e-4, atol=1e-5)
         for one, two in zip(plain._parameters, recorded._parameters, strict=True):
             assert torch.allclose(one.grad, two.grad, rtol=1e-3, atol=1e-5)

@@ -15,7 +15,7 @@ onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'visual-dex
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4-cube"], ids=["state-dependent", "gaussian"])
 def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, name, capsys):
     assert main(["export", str(SHIPPED_POLICIES[name]), str(tmp_path / "policy.onnx")]) == 0
-    assert "gives the same within" in capsys.readouterr().out
+    assert "gives the same" in capsys.readouterr().out
     policy = read_policy(SHIPPED_POLICIES[name])
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     for envs in (1, 7):
@@ -43,7 +43,7 @@ def test_a_vision_policy_has_two_networks_and_looks_at_any_number_of_points(tmp_
             np.testing.assert_allclose(found, wanted.detach().numpy(), atol=1e-4)
     actions = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     assert actions.get_inputs()[0].shape[1] == policy.teacher.num_observations
-    with pytest.raises(ValueError, match="of a vision policy, whose search computes with torch"):
+    with pytest.raises(ValueError, match="of a vision policy"):
         read_onnx(tmp_path / "policy.onnx")
 
 
@@ -63,7 +63,7 @@ def test_an_onnx_file_has_the_contract_of_its_policy_and_its_seal(tmp_path):
         data = bytearray(whole)
         data[place] ^= 1
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=r"policy\.onnx is damaged"):
+        with pytest.raises(ValueError, match=r"policy\.onnx is"):
             read_onnx(path)
-    with pytest.raises(FileNotFoundError, match=r"there is no policy .*none\.onnx"):
+    with pytest.raises(FileNotFoundError, match=r"none\.onnx"):
         read_onnx(tmp_path / "none.onnx")

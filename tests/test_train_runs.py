@@ -57,7 +57,7 @@ def test_three_and_three_more_equal_six(tmp_path, schedule):
 
 def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
     runner = make_runner(tmp_path, save_every=1)
-    runner._window = GoalWindow(2)
+    runner.window = GoalWindow(2)
     runner.learn(1)
     assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 1, (
         "before, it is the latest"
@@ -111,9 +111,8 @@ def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
 
 
 def test_limits_of_steps_and_time(tmp_path):
-    runner = make_runner(
-        tmp_path / "steps", max_steps=300
-    )  # 16 environments x 8 steps = 128 an iteration
+    # 16 environments x 8 steps = 128 an iteration.
+    runner = make_runner(tmp_path / "steps", max_steps=300)
     runner.learn()
     assert runner.iteration == 3 and runner.env_steps == 384
     timed = make_runner(tmp_path / "time", max_minutes=1e-6, save_every=100)
@@ -152,7 +151,7 @@ def test_nan_from_the_simulation_stops_and_is_not_saved(tmp_path, where):
             getattr(env, where).assign(values)
 
     env.step = poisoned
-    with pytest.raises(TrainingDivergedError, match=r"iteration 2: .*not finite.*--resume"):
+    with pytest.raises(TrainingDivergedError, match=r"iteration 2: .*finite.*--resume"):
         runner.learn(5)
     assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
 
@@ -220,7 +219,7 @@ def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
 def test_the_best_is_the_tightest_before_the_most_successful(tmp_path):
     env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, save_every=1)
-    runner._window = GoalWindow(1)
+    runner.window = GoalWindow(1)
     scores = []
     for tightness in (0.0, 0.5, 0.25):
         env.levels = Levels(1.0, tightness)
@@ -244,7 +243,7 @@ def _outputs(runner, observation: torch.Tensor) -> list[torch.Tensor]:
 def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path):
     adaptive = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
     first = make_runner(tmp_path / "first", ppo=adaptive, save_every=1)
-    first._window = GoalWindow(1)
+    first.window = GoalWindow(1)
     first.learn(3)
     checkpoint = find_checkpoint(tmp_path / "first", "latest")
     assert load_checkpoint(checkpoint)["best"] is not None
@@ -257,12 +256,12 @@ def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path)
     one, two = _weights(first), _weights(second)
     assert all(torch.equal(one[name], two[name]) for name in one)
     assert not second.env.env.step_count.numpy().any()
-    assert second._best is None and not second._window.full, (
+    assert second._best is None and not second.window.full, (
         "another run's rates would decide which is best"
     )
     second.learn(1)
     assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
-    with pytest.raises(ValueError, match="is a policy, which nothing can resume; --init"):
+    with pytest.raises(ValueError, match="nothing can resume; --init"):
         second.load(str(tmp_path / "first" / "policy.safetensors"))
     second.load(str(checkpoint))
     assert second.alg.learning_rate == first.alg.learning_rate, (
@@ -274,7 +273,7 @@ def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path)
     make_runner(tmp_path).learn(3)  # 16 environments x 8 steps = 128 an iteration
     resumed = make_runner(tmp_path, env=DummyEnv(num_envs=8), max_steps=600)
     resumed.load(str(find_checkpoint(tmp_path, "latest")))
-    assert resumed.new_episodes == "the checkpoint is of 16 environments a process, this run has 8"
+    assert "16 environments" in resumed.new_episodes
     assert resumed.total_iterations == 3 + 4  # 600 - 384 steps, 64 an iteration
     resumed.learn()
     assert _rows(tmp_path)[-1]["env_steps"] == 384 + 4 * 64

@@ -32,11 +32,10 @@ PAGE = "adapted.html"
 NOMINAL, IDENTIFIED = "nominal", "identified"
 """Models of the hand in which the policies are compared."""
 LOOSE = 0.4
-"""Level of stillness at which it begins: who has to stand still at once learns little. So
-begun, and with nothing random but the layer's numbers, 4.4 points more (2.1 to 6.8) come back than
-when the policy's own
-training goes on: 1300 validation episodes of two hidden models, 118 M steps. Neither was tried
-alone, nor half and twice."""
+"""Level of stillness at which it begins: who has to stand still at once learns little. So begun,
+and with nothing random but the layer's numbers, 4.4 points more (2.1 to 6.8) come back than when
+the policy's own training goes on: 1300 validation episodes of two hidden models, 118 M steps.
+Neither was tried alone, nor half and twice."""
 RATE, RAISE_AT = 0.0013, 0.1
 """It rises by so much an update while so many goals succeed, which they did: in 461 updates, 60 M
 steps of 16384 environments, to 1. Tried with LOOSE."""
@@ -250,11 +249,10 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     rows = tuple(row for compared in results for row in compared.rows if row.stopped_by != SUCCESS)
     result = Result(rows, results[0].software)
     page = cfg.out / PAGE
-    rate = {
-        (model, policy): percent(row.overall.outcomes["success"])
-        for (model, _), headlines in result.headlines().items()
-        for policy, row in headlines.items()
-    }
+    rate = {}
+    for (model, _), headlines in result.headlines().items():
+        for policy, row in headlines.items():
+            rate[model, policy] = percent(row.overall.outcomes["success"])
     layer = shown_name(str(cfg.hand_layer))
     summary = (
         f"{before} succeeds in {rate[NOMINAL, before]} of the episodes in the nominal model of "

@@ -200,9 +200,14 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     """
     from vd.envs.cfg import ReorientCfg
 
-    default, before, now = (
-        dict(leaves({k: t[k] for k in _SENSES if k in t}, "env"))
-        for t in (to_dict(ReorientCfg()), trained, task)
-    )
-    before = {k: default[k] for k in now if k in default} | before
-    return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
+    before = _senses(to_dict(ReorientCfg())) | _senses(trained)
+    changed = []
+    for name, here in _senses(task).items():
+        if name in before and before[name] != here:
+            changed.append(f"{name} {before[name]}, here {here}")
+    return changed
+
+
+def _senses(task: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides what observations and actions mean, by dotted names."""
+    return dict(leaves({name: task[name] for name in _SENSES if name in task}, "env"))

@@ -27,8 +27,7 @@ _NEEDED = {
     "alignment": ("spec", "task", "iter", "env_steps"),
     "student": ("contract", "task", "iter", "env_steps"),
 }
-"""What belongs to the weights of each network. Other projects' files have an actor
-too.
+"""What belongs to the weights of each network. Other projects' files have an actor too.
 """
 _ARRAY = "__numpy__"
 _WORLDS = "arrays"
@@ -51,8 +50,7 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
     Args:
         run_dir: Folder of the run.
         which: ``latest``: the newest that is sound. ``auto``: the same, or none in a folder without
-            any.
-            ``best``, or a file. None: a new run.
+            any. ``best``, or a file. None: a new run.
         network: What has to be in it, as in :func:`load_checkpoint`.
 
     Raises:
@@ -102,8 +100,8 @@ def prune_checkpoints(run_dir: Path, newest: int) -> None:
 
     What a run that went on from an older checkpoint finds after that stays.
     """
-    numbered = [(int(path.stem.removeprefix("model_")), path) for path in list_checkpoints(run_dir)]
-    for _, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
+    last = checkpoint_path(run_dir, newest)
+    for path in [path for path in list_checkpoints(run_dir) if path <= last][:-KEEP_LAST]:
         path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
         path.unlink(missing_ok=True)
@@ -194,7 +192,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(_plain(item) for item in value)
+        return type(value)(map(_plain, value))
     return value
 
 
@@ -205,5 +203,5 @@ def _restored(value: Any) -> Any:
             return value[_ARRAY].cpu().numpy().reshape(value["shape"])
         return {key: _restored(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(_restored(item) for item in value)
+        return type(value)(map(_restored, value))
     return value

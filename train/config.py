@@ -73,8 +73,8 @@ class PolicyCfg:
     std_range: tuple[float, float] = (1e-6, 1e6)
     """Bounds of the standard deviation; the default leaves it free, as in the paper's code."""
     quiet_std: float | None = None
-    """Lower bound of the standard deviation where success asks for its full stillness
-    (of the curriculum); the bound falls towards it with that level. None: it stays."""
+    """Lower bound of the standard deviation where success asks for its full stillness (of the
+    curriculum); the bound falls towards it with that level. None: it stays."""
     normalise_observations: bool = False
     """Subtract a running mean and divide by a running std; the paper does not."""
 

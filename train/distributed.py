@@ -80,9 +80,8 @@ def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
     """End this process at once when the block fails, and with it, through ``torchrun``, all others.
 
     The others wait in a collective that this process will never enter. Leaving the process group,
-    as at
-    a regular end, waits for them in turn: the error would be held back until the time limit, or for
-    ever.
+    as at a regular end, waits for them in turn: the error would be held back until the time limit,
+    or for ever.
     """
     try:
         yield

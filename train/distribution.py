@@ -31,9 +31,9 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
 
     rsl-rl's own state-dependent Gaussian clamps ``log std``: outside the range the gradient is
     zero, so a state whose std has reached a bound stays there whatever the reward says. A sigmoid
-    has the same range
-    and always a gradient. A bounded std matters here: unbounded it drifts upwards, and success asks
-    for slow fingers, which exploration noise at a std of 0.1 already hides.
+    has the same range and always a gradient. A bounded std matters here: unbounded it drifts
+    upwards, and success asks for slow fingers, which exploration noise at a std of 0.1 already
+    hides.
 
     ``init_std`` is that of every action in every state at the start, ``std_range`` an open
     interval.
@@ -70,7 +70,7 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
 
         Zero weights, and the bias that gives it.
         """
-        low, high = (math.log(bound) for bound in self.std_range)
+        low, high = map(math.log, self.std_range)
         share = (math.log(self.init_std) - low) / (high - low)
         head = mlp[-2]  # the linear layer before the reshape to [2, D]
         torch.nn.init.zeros_(head.weight[self.output_dim :])

@@ -148,23 +148,24 @@ def _export(
 
     network = network.eval().requires_grad_(False)
     number = torch.export.Dim("environments")
-    shapes = tuple(
-        {0: number} | {i: torch.export.Dim(f"{name}_{i}") for i in range(1, value.ndim - 1)}
-        for name, value in inputs.items()
-    )
+    shapes = []
+    for name, value in inputs.items():
+        sizes = {0: number}
+        for axis in range(1, value.ndim - 1):
+            sizes[axis] = torch.export.Dim(f"{name}_{axis}")
+        shapes.append(sizes)
     # It warns of libraries that this network does not need, and of its own future.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), atomic_path(path) as temporary:
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
-            tuple(
-                value[:2] for value in inputs.values()
-            ),  # of one it would take the number for fixed
+            # Of one it would take the number for fixed.
+            tuple(value[:2] for value in inputs.values()),
             temporary,
             input_names=list(inputs),
             output_names=outputs,
-            dynamic_shapes=shapes,
+            dynamic_shapes=tuple(shapes),
             dynamo=True,
             external_data=False,
             verbose=False,

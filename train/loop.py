@@ -185,7 +185,7 @@ class TrainingLoop:
         except Interrupted:
             whole = False
         finally:
-            self._close()
+            self.close()
         self.shutdown()
         return whole
 
@@ -298,9 +298,7 @@ class TrainingLoop:
         """Why processes and environments of a checkpoint cannot be restored; empty if they can."""
         if len(ranks) != self.world_size:
             return f"the checkpoint is of {len(ranks)} processes, this run has {self.world_size}"
-        if self.env is None or (saved := {saved_worlds(rank) for rank in ranks}) == {
-            self.env.num_envs
-        }:
+        if self.env is None or (saved := set(map(saved_worlds, ranks))) == {self.env.num_envs}:
             return ""
         if saved == {0}:
             return "the checkpoint holds no environments"
@@ -334,7 +332,7 @@ class TrainingLoop:
         if self.env is not None:
             self.env.env.load_state_dict(state["env"])
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Release the environments."""
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:

@@ -79,9 +79,7 @@ class GoalWindow:
                 means["reward/total"],
             )
         )
-        reached, dropped, timed_out, reward = (
-            math.fsum(column) for column in zip(*self._rows, strict=True)
-        )
+        reached, dropped, timed_out, reward = map(math.fsum, zip(*self._rows, strict=True))
         goals = reached + dropped + timed_out
         episodes = goals if self._success_ends else dropped + timed_out
         return {
@@ -98,7 +96,7 @@ class GoalWindow:
 
     def state_dict(self) -> list[list[float]]:
         """The rows, oldest first."""
-        return [list(row) for row in self._rows]
+        return list(map(list, self._rows))
 
     def load_state_dict(self, rows: list[list[float]]) -> None:
         """Restore :meth:`state_dict`."""

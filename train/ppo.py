@@ -64,9 +64,8 @@ class TeacherPPO(PPO):
     Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it
     as terminal. The value belongs to the stored observation *before* the step, because the
     observation returned after it is already the new episode's. That stands in for ``V(s_{t+1})`` of
-    the state that was
-    cut off, one control step later: a small error in one step of an episode, and no bias towards
-    zero.
+    the state that was cut off, one control step later: a small error in one step of an episode, and
+    no bias towards zero.
 
     Attributes:
         actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
@@ -148,12 +147,12 @@ class TeacherPPO(PPO):
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
-        self._take_samples()
+        self.take_samples()
         watched = self.actor_learns and self.schedule == "adaptive"
         divergence = 0.0
         steps = []
         for rows in self.minibatches():
-            steps.append(self._minibatch_step(rows))
+            steps.append(self.minibatch_step(rows))
             if watched and len(steps) % self.num_mini_batches == 0:
                 divergence = self._divergence(steps[-self.num_mini_batches :])
                 if divergence > RUNAWAY_KL * self.desired_kl:
@@ -182,7 +181,7 @@ class TeacherPPO(PPO):
         storage = self.storage
         return storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
 
-    def _take_samples(self) -> None:
+    def take_samples(self) -> None:
         """Copy the rollout into the memory that minibatches are gathered from."""
         storage = self.storage
         assert storage.distribution_params is not None, "there is no rollout"
@@ -212,7 +211,7 @@ class TeacherPPO(PPO):
             order = torch.randperm(samples, device=self.device)
             yield from order[: size * self.num_mini_batches].split(size)
 
-    def _minibatch_step(self, rows: torch.Tensor) -> torch.Tensor:
+    def minibatch_step(self, rows: torch.Tensor) -> torch.Tensor:
         """One optimiser step on these samples.
 
         Returns:
@@ -262,9 +261,8 @@ class TeacherPPO(PPO):
             loss = loss + self.bound_coef * excess.square().sum(dim=-1).mean()
 
         loss.backward()
-        self.actor.distribution._distribution = (
-            None  # or this pass would outlive itself, and a recording
-        )
+        # Or this pass would outlive itself, and a recording.
+        self.actor.distribution._distribution = None
         with torch.no_grad():
             clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
             beyond = (excess > 0.0).float().mean()
@@ -278,9 +276,8 @@ class TeacherPPO(PPO):
         normaliser = network.obs_normalizer
         std = getattr(normaliser, "_std", None)
         network.update_normalization(self.storage.observations.flatten(0, 1))
-        if (
-            std is not None
-        ):  # rsl-rl makes a new tensor of it, which a recorded graph would not read
+        # rsl-rl makes a new tensor of it, which a recorded graph would not read.
+        if std is not None:
             std.copy_(normaliser._std)
             normaliser._std = std
 

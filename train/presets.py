@@ -325,7 +325,6 @@ def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
             logger="none",
         ),
         ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
-        env=replace(
-            cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)
-        ),  # finding them takes long
+        # Finding poses takes long.
+        env=replace(cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)),
     )

@@ -67,7 +67,8 @@ class TeacherRunner(TrainingLoop):
             self.failures = ObjectFailures(env.env.world_object, ppo.failure_floor, device)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means = StepMeans()
-        self._window = self._new_window()
+        self.window = self._new_window()
+        """The newest goals, by which the best is chosen."""
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._better = False
@@ -129,7 +130,7 @@ class TeacherRunner(TrainingLoop):
         too high and no later one would beat them.
         """
         self._better = self.iteration > 0 and (self._best is None or self._score > self._best)
-        if self._better and self._window.full:
+        if self._better and self.window.full:
             self._best = self._score
         super().save()
 
@@ -143,9 +144,8 @@ class TeacherRunner(TrainingLoop):
         return self.ppo.rollout_steps * self.env.num_envs
 
     def _begin(self) -> None:
-        if (
-            self._stagger_due
-        ):  # new environments begin within their episode, or all would time out at once
+        # New environments begin within their episode, or all would time out at once.
+        if self._stagger_due:
             steps = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(
                 steps, high=int(self.env.max_episode_length)
@@ -174,7 +174,7 @@ class TeacherRunner(TrainingLoop):
         figures: dict[str, Any] = {
             "collect_s": round(collected - start, 4),
             "learn_s": round(learned - collected, 4),
-            **self._window.add(means),
+            **self.window.add(means),
             "action_std": action_std,
             "critic_warmup": self.critic_warmup,
             "actor_learning_rate": self.alg.learning_rate,
@@ -239,7 +239,7 @@ class TeacherRunner(TrainingLoop):
         state = {
             "infos": None,
             "best": list(self._best) if self._best is not None else None,
-            "window": self._window.state_dict(),
+            "window": self.window.state_dict(),
             "critic_warmup": self.critic_warmup,
             "policy": to_dict(self._spec()),
             "learner": {"ppo": to_dict(self.ppo), "policy": to_dict(self.policy_cfg)},
@@ -263,9 +263,10 @@ class TeacherRunner(TrainingLoop):
         if self.failures is not None and "failures" in state:
             self.failures.load_state_dict(state["failures"])
         self._best = tuple(state["best"]) if state["best"] is not None else None
-        self._window.load_state_dict(state["window"])
+        self.window.load_state_dict(state["window"])
         self._restore(state)
         self._stagger_due = bool(self.new_episodes)
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Free the environments."""
         self.env.env.close()

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from vd.command import interrupt
@@ -35,6 +36,11 @@ Cfg = TypeVar("Cfg", "AlignmentTrainCfg", "StudentTrainCfg")
 Network = TypeVar("Network")
 Trainer = TypeVar("Trainer", bound="SupervisedLoop")
 
+HELP = """Flags start from --preset and --stage, or with --resume from the run's config.json; the network's
+sizes from --init. Short forms: --objects, --num-envs and --seed stand for --task.objects and so on,
+--validate for --task.validation. Ctrl-C saves."""
+"""What ``--help`` says of each."""
+
 SHORT_FORMS = {
     "objects": "task.objects",
     "num-envs": "task.num-envs",
@@ -50,14 +56,16 @@ class StagedTraining(Generic[Cfg]):
 
     name: str
     """Its name."""
-    help: str
+    stages: str
     """What ``--help`` says first."""
     presets: Mapping[str, Callable[[Any], Cfg]]
     """Settings of a stage, by the name of the preset."""
     smoke: Callable[[Any], Cfg]
     """Settings of a stage's smoke test."""
-    begin_from: Callable[[Cfg, str | None], Cfg]
-    """Settings with what ``--init`` names, or with the stage before where it names nothing."""
+    stage_before: Callable[[Cfg], str | None]
+    """What such settings begin from where ``--init`` names nothing; None: from nothing."""
+    as_in: Callable[[Cfg, str], Cfg]
+    """Settings with the sizes and the camera of the network that is named."""
     build: Callable[[Cfg, Callable[[str], object]], "SupervisedLoop"]
     """From settings to a trainer."""
     result: str
@@ -87,7 +95,8 @@ def parse_stage(training: StagedTraining[Cfg], flags: Sequence[str]) -> Cfg:
         if saved is not None:
             return _parsed(training, arguments, saved, file)
     base = replace(base, teacher=asked.teacher or installed_teacher(base.teacher))
-    base = training.begin_from(base, value_of(arguments, "--init"))
+    if init := value_of(arguments, "--init") or training.stage_before(base):
+        base = replace(training.as_in(base, init), init=Path(init))
     return _parsed(training, arguments, base, file)
 
 
@@ -97,7 +106,9 @@ def _parsed(
     """Every flag, with the values of ``file`` and ``base`` for the others."""
     base = base if file is None else file.over(base)
     prog = f"vd-train {training.name}"
-    cfg: Cfg = parse(type(base), arguments, default=base, prog=prog, description=training.help)
+    cfg: Cfg = parse(
+        type(base), arguments, default=base, prog=prog, description=f"{training.stages} {HELP}"
+    )
     teacher = [] if cfg.teacher is None else [cfg.teacher]
     check_names(teacher, (*cfg.task.objects, *cfg.task.validation))
     return cfg

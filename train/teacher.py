@@ -151,9 +151,8 @@ def train(cfg: TeacherCfg, say: Callable[[str], None]) -> int:
                 f"{'the same command' if cfg.resume == 'auto' else again}"
             )
         return interrupt.INTERRUPTED
-    from vd.train.checkpoint import (
-        POLICY_NAME,
-    )  # loads torch, which the first message should not wait for
+    # It loads torch, which the first message should not wait for.
+    from vd.train.checkpoint import POLICY_NAME
 
     if cfg.smoke:
         say(

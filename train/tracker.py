@@ -148,6 +148,7 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
     Raises:
         ValueError: It is neither, or observes what no camera shows.
     """
+    from vd.evaluate.spin import spins
     from vd.policy.agents import open_policy, open_teacher, policy_name
     from vd.policy.contract import TrackingSpec
     from vd.tracking.policy import TrackingPolicy
@@ -162,6 +163,11 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
+    if spins(teacher):
+        raise ValueError(
+            f"{cfg.teacher} turns objects without a goal by its joints alone, which needs no "
+            "camera: give a teacher that has goals"
+        )
     if terms := teacher.task["observation"].get("terms"):
         raise ValueError(
             f"{cfg.teacher} observes {', '.join(terms)}, which no camera shows; give another"

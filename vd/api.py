@@ -196,9 +196,8 @@ def analyse_gap(recording: str | Path, out: str | Path, **settings: Any) -> "Rep
             import it.
         ValueError: The recording or a setting cannot be used.
     """
-    if getattr(
-        multiprocessing.current_process(), "_inheriting", False
-    ):  # a worker that imports the script
+    # A worker that imports the script.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise RuntimeError(
             'analyse_gap() starts processes: call it under if __name__ == "__main__":'
         )

@@ -78,7 +78,7 @@ class ReorientVectorEnv(VectorEnv):
         self._action = wp.to_torch(env.action)
         self._observation, self._reward = wp.to_torch(env.observation), wp.to_torch(env.reward)
         self._error = wp.to_torch(env.rotation_error)
-        self._flags = [wp.to_torch(array) for array in (env.ended, env.success, env.fell)]
+        self._flags = list(map(wp.to_torch, (env.ended, env.success, env.fell)))
         self._over = torch.zeros_like(self._reward, dtype=torch.bool)
         self._bad = torch.zeros((), dtype=torch.bool, device=self._action.device)
 

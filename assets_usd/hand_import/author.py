@@ -148,7 +148,7 @@ class Author:
         for i, shape in enumerate(colliders):
             self._collider(f"{path}/collision/c{i}", shape, self._is_tip(number, shape, colliders))
         drawings = [shape for shape in link.shapes if not shape.collides] or colliders
-        meshes = [shape_mesh(shape) for shape in drawings]
+        meshes = list(map(shape_mesh, drawings))
         for i, (shape, (vertices, faces)) in enumerate(zip(drawings, meshes, strict=True)):
             mesh = self._mesh(f"{path}/visual/v{i}", vertices, faces)
             mesh.CreateDisplayColorAttr([Gf.Vec3f(*shape.colour)])
@@ -304,7 +304,7 @@ def _float(prim: Usd.Prim, name: str, value: float) -> None:
 
 
 def _quat(xyzw: np.ndarray) -> Gf.Quatd:
-    x, y, z, w = (float(v) for v in canonical_quat(np.asarray(xyzw, dtype=float)))
+    x, y, z, w = map(float, canonical_quat(np.asarray(xyzw, dtype=float)))
     return Gf.Quatd(w, x, y, z)
 
 

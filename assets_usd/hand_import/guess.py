@@ -300,7 +300,7 @@ def _workspace(
     tops = [_reach(palm, *shape_box(shape)) for shape in tree.links[0].colliders]
     above = max(max(tops, default=0.0) + 0.5 * float(np.mean(size)) - palm @ middle, 0.0)
     goal = placed(mount, middle + above * palm)
-    x, y, z = said.goal or (float(v) for v in goal)
+    x, y, z = said.goal or map(float, goal)
     drop = said.drop or (x, y, z + DROP_M)
     fall = said.fall or FALL * reach
     for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": (fall,)}.items():

@@ -228,14 +228,14 @@ def _urdf_shape(builder: Any, number: int) -> Shape:
     import newton
 
     kind = newton.GeoType(builder.shape_type[number]).name.lower().removeprefix("convex_")
-    scale = tuple(float(factor) for factor in builder.shape_scale[number])
+    scale = tuple(map(float, builder.shape_scale[number]))
     flags = builder.shape_flags[number]
     shape = Shape(
         kind,
         scale[: SIZE_NUMBERS.get(kind, 2)],
         np.array(builder.shape_transform[number], dtype=float),
         bool(flags & newton.ShapeFlags.COLLIDE_SHAPES),
-        colour=tuple(float(part) for part in builder.shape_color[number]),
+        colour=tuple(map(float, builder.shape_color[number])),
     )
     if kind == "mesh":
         mesh = builder.shape_source[number]

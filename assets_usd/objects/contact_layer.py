@@ -42,17 +42,6 @@ class ContactParameter(NamedTuple):
     record: str
     relative: bool = False
 
-    def of(self, item: Any) -> np.ndarray:
-        """As an object (:class:`vd.assets_usd.objects.model.ObjectModel`) has it.
-
-        Identified, or nominal.
-        """
-        name = next(key for key, parameter in CONTACT.items() if parameter is self)
-        usd_values = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
-        return np.array(
-            usd_values.get(name, item.contact.get(name, (self.nominal,))[0]), dtype=float
-        )
-
 
 _MATERIALS = PAPER.materials
 CONTACT: dict[str, ContactParameter] = {
@@ -95,6 +84,19 @@ CONTACT: dict[str, ContactParameter] = {
     ),
 }
 """Parameters by name; names are a contract: USD attributes and keys of reports."""
+
+
+def contact_of(item: Any, name: str) -> np.ndarray:
+    """A parameter as an object has it, identified or nominal.
+
+    Args:
+        item: :class:`vd.assets_usd.objects.model.ObjectModel`.
+        name: Key of :data:`CONTACT`.
+    """
+    usd_values = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
+    value, *_ = item.contact.get(name, (CONTACT[name].nominal,))
+    return np.array(usd_values.get(name, value), dtype=float)
+
 
 Identified = Mapping[str, tuple[tuple[float, ...], ...]]
 """By parameter three tuples of as many numbers as it has: value, low and high end of the 95 %

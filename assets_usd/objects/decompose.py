@@ -101,9 +101,8 @@ def _limited(parent: int, seconds: float) -> None:
     limit = int(time.process_time()) + max(1, round(seconds))
     resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.environ["OMP_WAIT_POLICY"] = (
-        "passive"  # threads that wait for each other take no processor time
-    )
+    # Threads that wait for each other take no processor time.
+    os.environ["OMP_WAIT_POLICY"] = "passive"
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
@@ -152,9 +151,10 @@ def decompose(
         max_vertices: Most vertices of a part.
     """
     parts = _parts_or_reason(settings.time_limit, surface, settings, max_vertices)
-    hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
-    why = parts if isinstance(parts, str) else "it gave only slivers"
-    if hulls:
+    why = "it gave only slivers"
+    if isinstance(parts, str):
+        why = parts
+    elif hulls := tidy_hulls(parts, max_vertices):
         return Decomposition(hulls, "coacd")
     hull = simplify_hull(convex_hull(surface.vertices), max_vertices)
     return Decomposition(

@@ -68,11 +68,9 @@ MAX_DECOMPOSED_FACES = 12_000
 MAX_ERROR = 1.0
 MAX_OFFSET = 0.03
 """Parts are refused if they differ from the mesh by more than its volume, and are farther from its
-surface,
-on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10
-mm. Of
-thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its
-volume.
+surface, on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a
+radius of 10 mm. Of thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as
+parts differs by its volume.
 """
 
 LAST_REMEDY = "export it again with fewer faces, or import it alone (--jobs 1)"
@@ -264,7 +262,7 @@ def import_meshes(
     settings.check()
     out = Path(out)
     check_set_folder(out)
-    plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings.licence)
+    plan = plan_jobs(find_meshes(list(map(Path, paths))), out, settings.licence)
     results: dict[str, ImportResult] = {}
 
     def finish(result: ImportResult) -> None:

@@ -89,8 +89,7 @@ def scales_that_fit(
 ) -> tuple[float, float]:
     """Least and largest factor to metres by which a shape fits a hand.
 
-    A shape that fits at no size has a least factor above the
-    largest.
+    A shape that fits at no size has a least factor above the largest.
 
     Args:
         sides: Sides of the bounding box in the shape's units, in any order, none of them 0 [3].

@@ -233,7 +233,7 @@ def default_set(paths: Sequence[Path]) -> Path:
         MeshError: The set holds objects from elsewhere.
         ObjectError: The name is that of a built-in set.
     """
-    above = Path(os.path.commonpath([absolute(path) for path in paths]))
+    above = Path(os.path.commonpath(list(map(absolute, paths))))
     plain = re.sub(r"[^\w.-]+", "_", above.name).strip(".") or "objects"
     name = object_name(above) if above.is_file() else plain
     folder = objects_dir() / name

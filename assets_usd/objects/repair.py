@@ -46,9 +46,8 @@ MOST_PIECES = 5000
 
 OTHER_BODIES = 0.05
 """Bodies apart that hold less than this share of the volume are debris and are left out. With more
-there are
-several objects: which of them is meant cannot be known, and one rigid body cannot stand for
-them.
+there are several objects: which of them is meant cannot be known, and one rigid body cannot stand
+for them.
 """
 
 FILLED_AREA = 0.1

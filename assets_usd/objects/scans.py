@@ -78,9 +78,8 @@ def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
     pitch = float((high - low).max()) / CELLS
     corner = low - MARGIN_CELLS * pitch
     x, y, z = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * MARGIN_CELLS).tolist()
-    winding = wp.zeros(
-        (x, y, z), dtype=float, device=device
-    )  # the outermost stay zero, which closes it
+    # The outermost stay zero, which closes it.
+    winding = wp.zeros((x, y, z), dtype=float, device=device)
     inner = winding[1 : x - 1, 1 : y - 1, 1 : z - 1]
     wp.launch(
         winding_kernel,

@@ -113,7 +113,7 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     summary = f"volume error {np.median(errors):.1%}, worst {max(errors):.1%}"
     head = _lines(f"{title}, objects: {len(models)}", TITLE_POINTS, width)
     head += _lines(summary, TITLE_POINTS, width)
-    captions = [_caption(model) for model in models]
+    captions = list(map(_caption, models))
     most_lines = max(caption.count("\n") + 1 for caption in captions)
     caption_in = _height_in(most_lines, CAPTION_POINTS)
     head_in = _height_in(len(head), TITLE_POINTS) + MARGIN_IN

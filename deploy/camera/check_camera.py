@@ -174,7 +174,7 @@ def camera_findings(
     yield _lens(lens, place_seen.spot)
     images = [frame.image for frame in frames]
     valid = np.mean([(image >= lens.near) & (image <= lens.far) for image in images])
-    share = float(np.mean([place_seen.seen(image) for image in images]))
+    share = float(np.mean(list(map(place_seen.seen, images))))
     if share < DEPTH_SHARE:
         yield Finding("camera depth", False, _unseen(share, DEPTH_SHARE))
     else:

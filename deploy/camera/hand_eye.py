@@ -171,7 +171,7 @@ def _by_motions(views: Views) -> np.ndarray:
 
 def _inverse(poses: np.ndarray) -> np.ndarray:
     """The inverse of each pose [N, 7]."""
-    return np.array([invert(pose) for pose in poses])
+    return np.array(list(map(invert, poses)))
 
 
 def refine(
@@ -188,7 +188,7 @@ def refine(
     Raises:
         HandEyeError: The views do not determine the camera.
     """
-    fingers = [int(f) for f in np.unique(views.finger)]
+    fingers = list(map(int, np.unique(views.finger)))
     start = np.stack([camera, *(cubes[f] for f in fingers)])
     place = np.searchsorted(fingers, views.finger)
 
@@ -220,8 +220,7 @@ def refine(
 def _scatter(jacobian: np.ndarray, residual: np.ndarray, views: int) -> tuple[np.ndarray, int]:
     """Covariance of all parameters and its degrees of freedom, from the scatter between views.
 
-    The corners of a view err together (joints, the cube's seat, light), so the views are
-    what is
+    The corners of a view err together (joints, the cube's seat, light), so the views are what is
     independent: the sandwich of Bell and McCaffrey (2002) with residuals as if their view had been
     left out.
     """

@@ -2,8 +2,7 @@
 
 A state counts only whole and fresh: right motor, right length, no error number, angles that a motor
 can count, a clock that went on as ours did, and no farther from the last one than the motor can
-turn. A checksum
-alone is not enough: its 16 bits pass one of 65536 broken packets.
+turn. A checksum alone is not enough: its 16 bits pass one of 65536 broken packets.
 """
 
 from collections.abc import Sequence

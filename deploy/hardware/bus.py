@@ -101,7 +101,8 @@ class MotorBus:
         self._sdk = sdk()
         self._lock = threading.RLock()
         self._packets = self._sdk.PacketHandler(2.0)
-        self._states = StateCheck(self.ids, models)
+        self.states = StateCheck(self.ids, models)
+        """Which answers are states of the motors."""
         self._goals = b""
         self._length = STATE_BYTES
         self._settings: dict[int, MotorSettings] = {}
@@ -202,7 +203,7 @@ class MotorBus:
         """IDs of all motors that answer a ping to all."""
         with self._line():
             motors, _ = self._packets.broadcastPing(self._port)
-        return [int(id) for id in motors]
+        return list(map(int, motors))
 
     def missing(self) -> dict[int, str]:
         """What is wrong with the motors that do not answer, or are of another model, by ID."""
@@ -258,8 +259,8 @@ class MotorBus:
             raise BusError("; ".join(wrong))
         with self._lock:
             self._settings = dict(settings)
-            self._states.fastest[:] = [settings[id].velocity_limit_rad_s for id in self.ids]
-            self._states.forget()
+            self.states.fastest[:] = [settings[id].velocity_limit_rad_s for id in self.ids]
+            self.states.forget()
 
     def _to_set(self, id: int, settings: MotorSettings) -> dict[str, tuple[int, int]]:
         """Registers that are ours to set and differ: value, and the wanted one."""
@@ -398,7 +399,7 @@ class MotorBus:
                 # Motors measure when they have heard it, or not before they answer. A later time
                 # than theirs would look like a delay of the goals, which has a name; an earlier one
                 # does not.
-                return self._states.accept(heard, answers)
+                return self.states.accept(heard, answers)
         except BusError:
             self.rejected += 1
             self._length = STATE_BYTES + OTHER_BYTES - self._length

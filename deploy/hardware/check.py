@@ -188,7 +188,7 @@ def _holding(bus: MotorBus) -> str:
     on = bus.read_torque()
     if not on.any():
         return ""
-    ids = ", ".join(str(id) for id in np.array(bus.ids)[on])
+    ids = ", ".join(map(str, np.array(bus.ids)[on]))
     current = float(np.abs(bus.read_state().current[on]).max())
     return (
         f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are "
@@ -268,7 +268,7 @@ def wiggle(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
     hand = connection.hand
     home = safe.arm().position
     for axis, name in enumerate(hand.joint_names):
-        goal = _free_turn(hand, home, axis)
+        goal = free_turn(hand, home, axis)
         way = _tip_goes(hand, home, goal, hand.joint_finger[axis])
         motor = connection.joints.ids[axis]
         print(f"watch {name}, motor {motor}: {way}", file=sys.stderr, flush=True)
@@ -284,7 +284,7 @@ def wiggle(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
             yield Finding(f"wiggle of {name}", False, f"{words}: blocked?")
 
 
-def _free_turn(hand: "HandModel", pose: np.ndarray, axis: int) -> np.ndarray:
+def free_turn(hand: "HandModel", pose: np.ndarray, axis: int) -> np.ndarray:
     """A pose [rad] [D] with one joint turned so that its fingertip goes outwards, where it is free.
 
     Without torque fingers lean on what lies between them. At an end of its range a joint turns the

@@ -344,7 +344,7 @@ def _session(
             )
         question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
     ready(connection, question, yes=cfg.yes)
-    columns = [connection.joints.names.index(name) for name in joints]
+    columns = list(map(connection.joints.names.index, joints))
     with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
         safe.arm()
         for number, motion in enumerate(motions, 1):

@@ -4,8 +4,8 @@ What is wanted of each, whether we set it or refuse, and why.
 
 One table for the preflight, which compares, and for
 :meth:`vd.deploy.hardware.bus.MotorBus.configure`, which writes. What is wanted is the hand's own
-value, and else the factory's. The other registers tell, or act in
-other operating modes alone: velocity gains, goal velocity.
+value, and else the factory's. The other registers tell, or act in other operating modes alone:
+velocity gains, goal velocity.
 """
 
 from collections.abc import Mapping

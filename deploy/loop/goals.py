@@ -122,7 +122,7 @@ def make_goals(texts: Sequence[str]) -> list[np.ndarray]:
     Raises:
         GoalError: One is none.
     """
-    return [_goal(text) for text in texts]
+    return list(map(_goal, texts))
 
 
 def drawn_goals(symmetry: np.ndarray, count: int, *, seed: int = 0) -> list[np.ndarray]:
@@ -148,7 +148,7 @@ def drawn_goals(symmetry: np.ndarray, count: int, *, seed: int = 0) -> list[np.n
 def _goal(text: str) -> np.ndarray:
     turn, _, degrees = text.partition("@")
     try:
-        numbers = np.array([float(part) for part in turn.split(",")])
+        numbers = np.array(list(map(float, turn.split(","))))
         angle = np.radians(float(degrees)) if "@" in text else 0.0
     except ValueError:
         numbers = np.zeros(0)
@@ -200,8 +200,7 @@ def _unit(path: Path, longest: float) -> float:
     if not fitting:
         raise GoalError(
             f"{path}: its longest side is {longest:.4g} units, which in "
-            f"{' or '.join(GUESSED_UNITS)} is not "
-            f"within {100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or "
-            "scale the file to metres"
+            f"{' or '.join(GUESSED_UNITS)} is not within {100 * low:.0f} to {100 * high:.0f} cm; "
+            "cut away what is not the object, or scale the file to metres"
         )
     return fitting[0]

@@ -152,7 +152,7 @@ class LogWriter:
         """A goal [4] is begun; one that was not known when the log began is noted first."""
         goals = self.run["goals"]
         if number == len(goals):
-            goals.append([float(value) for value in goal])
+            goals.append(list(map(float, goal)))
             run = {**self.run, "goals": list(goals)}
             self._later(lambda: write_json(self.folder / RUN_FILE, run))
         self.event("goal", goal=number)

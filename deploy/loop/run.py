@@ -428,7 +428,7 @@ def _description(
         "kind": runner.kind,
         "twin": cfg.twin,
         "object": {"name": item.name, "set": cfg.object},
-        "goals": [[float(value) for value in goal] for goal in goals],
+        "goals": [list(map(float, goal)) for goal in goals],
         "control_hz": runner.task.sim.control_hz,
         "stopping": vars(runner.rule),
         "tolerance_rad": cfg.tolerance_rad,

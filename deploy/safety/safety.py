@@ -2,16 +2,13 @@
 
 They hold whatever it decides.
 
-    with SafeHand(bus, joints, cfg) as safe:           # preflight has passed, the person has
-    confirmed
-        safe.arm()                                     # torque on where the hand is; watchdogs run
-        from here
+    with SafeHand(bus, joints, cfg) as safe:  # preflight has passed, the person has confirmed
+        safe.arm()                            # torque on where the hand is; watchdogs run
         while not done:
-            state = safe.read()                        # joints' frame [rad]; checked
-            goal = safe.command(target)                # limited, sent; what was sent
-            safe.image_at(time_s)                      # of the newest image, where there is a
-            camera safe.beat(missed=late)                     # once per control step, after its
-            work
+            state = safe.read()               # joints' frame [rad]; checked
+            goal = safe.command(target)       # limited, sent; what was sent
+            safe.image_at(time_s)             # of the newest image, where there is a camera
+            safe.beat(missed=late)            # once per control step, after its work
 
 Whatever ends the block, the hand is brought to a hold where it is, and then, as configured, its
 torque is switched off. A limit that is passed, a lost bus, a stale image, missed deadlines or a
@@ -510,10 +507,9 @@ class SafeHand:
                 return dict.fromkeys(left, str(error))
             left = self.bus.torque(False, list(left))
             if not left:
+                # What the watchdogs guarded is off, and they are in other programs' way.
                 with contextlib.suppress(BusError):
-                    self.bus.watch(
-                        0.0
-                    )  # what it guarded is off; other programs would find it in their way
+                    self.bus.watch(0.0)
             if not left or self.bus.clock.now() > end:
                 return left
 

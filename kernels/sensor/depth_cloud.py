@@ -2,8 +2,8 @@
 
 Crop by height, choose a fixed number of points, carry to the base.
 
-Pixels are gathered in tiles, which have a bit of a word for each of theirs.
-Launch order: ``crop_pixels_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
+Pixels are gathered in tiles, which have a bit of a word for each of theirs. Launch order:
+``crop_pixels_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
 """
 
 import warp as wp
@@ -44,9 +44,7 @@ def crop_pixels_kernel(
     camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
     depth_in: wp.array3d[float],  # [N, H, W] depth [m], 0 for none
     # Out:
-    tile_pixels_out: wp.array2d[
-        wp.uint32
-    ],  # [N, T] bit k is set if the tile's pixel k is within the crop
+    tile_pixels_out: wp.array2d[wp.uint32],  # [N, T] bit k: the tile's pixel k is within the crop
     tile_first_out: wp.array2d[int],  # [N, T] points before each tile in its row of tiles
     row_count_out: wp.array2d[int],  # [N, T / tile_columns] points of each row of tiles
 ):

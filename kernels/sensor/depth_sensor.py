@@ -25,9 +25,7 @@ class DepthSensorParams:
     disparity_std: float  # standard deviation of the disparity [pixel]
     disparity_step: float  # rounding of the disparity [pixel]
     shadow: float  # as depth_disparity, in pixels of the image: what :func:`is_hidden` has no value
-    edge_jump: (
-        float  # difference of depth to one of the four neighbours that makes a pixel an edge [m]
-    )
+    edge_jump: float  # difference of depth to one of four neighbours that makes an edge [m]
     edge_dropout: float  # probability that an edge pixel has no value
     flying: float  # probability that an edge pixel lies somewhere between both surfaces
     dropout: float  # probability that any pixel has no value
@@ -145,9 +143,7 @@ def delay_poses_kernel(
     delay_in: wp.array[float],  # [N] age of the poses that are wanted [frame], 0 to L - 1
     body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
     # In/Out:
-    history: wp.array3d[
-        wp.transform
-    ],  # [L, N, B] poses of the last L frames, frame k in slot k mod L
+    history: wp.array3d[wp.transform],  # [L, N, B] poses of the last L frames, k in slot k mod L
     # Out:
     late_q_out: wp.array2d[wp.transform],  # [N, B] body poses in the world frame at that time
 ):

@@ -102,9 +102,7 @@ def place_camera_kernel(
 @wp.kernel
 def place_meshes_kernel(
     # Model:
-    shape_body: wp.array[
-        int
-    ],  # [S] body of each shape, an index within a world; negative for the world
+    shape_body: wp.array[int],  # [S] body of each shape, an index within a world; < 0: the world
     # In:
     camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
     body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
@@ -147,9 +145,7 @@ def cast_rays_kernel(
     triangles: wp.array[wp.vec3i],  # [F] vertices of all triangles, mesh after mesh
     mesh_first: wp.array[int],  # [M + 1] first triangle of each mesh, and the end of the last
     slot_shape: wp.array[int],  # [K] shape of each thread
-    slot_index: wp.array[
-        int
-    ],  # [K] each thread's triangle within the shape's mesh; there may be fewer
+    slot_index: wp.array[int],  # [K] each thread's triangle within the shape's mesh, if it has it
     shape_mesh: wp.array2d[int],  # [N, S] mesh of each shape
     shape_scale: wp.array2d[float],  # [N, S] size factor of each shape
     # In:

@@ -61,9 +61,7 @@ def nearness_kernel(
     # In:
     points_in: wp.array2d[wp.vec3],  # [N, K] what it saw, base frame [m], NaN for none
     # In/Out:
-    nearness: wp.array3d[
-        float
-    ],  # [N, Y, X] one over depth [1/m], zeros before; 0 where nothing was seen
+    nearness: wp.array3d[float],  # [N, Y, X] one over depth [1/m], zeros before; 0: nothing seen
 ):
     """How near the nearest is that was seen in each cell of the image. Launch: [N, K]."""
     world, k = wp.tid()
@@ -211,14 +209,10 @@ def fit_poses_kernel(
     world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
     seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
     count_in: wp.array[int],  # [N] how many there are
-    nearness_in: wp.array3d[
-        float
-    ],  # [N, Y, X] from ``nearness_kernel``; [N, 0, 0] without a camera
+    nearness_in: wp.array3d[float],  # [N, Y, X] of ``nearness_kernel``; [N, 0, 0] without a camera
     # In/Out:
     pose: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
-    misfit: wp.array2d[
-        float
-    ],  # [M, C] both mean squares added [m^2]; NEVER where nothing is to be done
+    misfit: wp.array2d[float],  # [M, C] both mean squares added [m^2]; NEVER: nothing to do
 ):
     """Improve poses until they stay, and say how badly they fit. Launch: [M, C]."""
     row, c = wp.tid()
@@ -230,9 +224,8 @@ def fit_poses_kernel(
         before = best
         best = improved(shapes, world, before, far, every, seen_in, count_in)
         shift = wp.transform_get_translation(best) - wp.transform_get_translation(before)
-        turn = wp.transform_get_rotation(best) - wp.transform_get_rotation(
-            before
-        )  # half the angle, if small
+        # Half the angle, if small.
+        turn = wp.transform_get_rotation(best) - wp.transform_get_rotation(before)
         if wp.length(shift) < SETTLED_M and 2.0 * wp.length(turn) < SETTLED_RAD:
             break
     pose[row, c] = best

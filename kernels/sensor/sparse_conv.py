@@ -73,9 +73,7 @@ def voxel_feature_kernel(
     start_in: wp.array[wp.int64],  # [M + 1] first of each voxel's points in that order, and the end
     voxel_size: float,  # side of a voxel [m]
     # Out:
-    feature_out: wp.array2d[
-        float
-    ],  # [M, 4 C] of each kind: 1 if a point is there, their mean place
+    feature_out: wp.array2d[float],  # [M, 4 C] of each kind: 1 if a point is there, mean place
 ):
     """Tell what points a voxel holds, and where in it, from its middle [voxels]. Launch: [M, C].
 

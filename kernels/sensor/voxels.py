@@ -67,14 +67,10 @@ def voxel_key(cloud: wp.int64, x: int, y: int, z: int) -> wp.int64:
 @wp.kernel
 def voxel_key_kernel(
     # In:
-    points_in: wp.array2d[
-        wp.vec3
-    ],  # [B, P] points [m]; what is not finite or out of the grid is no voxel
+    points_in: wp.array2d[wp.vec3],  # [B, P] points [m]; not finite or out of the grid: no voxel
     voxel_size: float,  # side of a voxel [m]
     # Out:
-    key_out: wp.array2d[
-        wp.int64
-    ],  # [B, P] keys; those of points that count for nothing name cloud B
+    key_out: wp.array2d[wp.int64],  # [B, P] keys; of points that count for nothing: cloud B
 ):
     """Key of the voxel of each point. Launch: [B, P]."""
     cloud, point = wp.tid()
@@ -99,9 +95,7 @@ def beside_kernel(
     key_in: wp.array[wp.int64],  # [M] keys of voxels, each once, ascending
     other_in: wp.array[wp.bool],  # [M] which are the others
     # Out:
-    beside_out: wp.array[
-        wp.bool
-    ],  # [M] which are among the others or touch one, by a corner at least
+    beside_out: wp.array[wp.bool],  # [M] which are among the others or touch one, if by a corner
 ):
     """Tell of each voxel whether any of the 3x3x3 about it is one of the others. Launch: [M]."""
     row = wp.tid()

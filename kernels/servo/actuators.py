@@ -10,8 +10,8 @@ holds still at coarse steps. Filter and profile give their mean over the step, a
 that arrives within it.
 
 Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world;
-the parameters' are in an array, or in a matrix that a kernel has read once.
-SI units, radians; time in seconds since the joint was switched on.
+the parameters' are in an array, or in a matrix that a kernel has read once. SI units, radians; time
+in seconds since the joint was switched on.
 """
 
 from typing import Any
@@ -229,10 +229,9 @@ def elastic_load(
     """Advance the second mass behind its spring by one step.
 
     A leapfrog step, which has no damping of its own, with the mass increased as average
-    acceleration
-    asks: stable with any spring. The joint's side gets the same as a damping that acts on the
-    change of
-    its velocity only: ``dt k / 2`` implicitly, less its torque at the present velocity.
+    acceleration asks: stable with any spring. The joint's side gets the same as a damping that acts
+    on the change of its velocity only: ``dt k / 2`` implicitly, less its torque at the present
+    velocity.
 
     Returns:
         The torque on the joint [N m] and the damping [N m s/rad], to be treated implicitly.
@@ -277,9 +276,7 @@ def rest_play(
     power: float,  # as in :func:`drive_joint`; with the torque off the play stays at the command
     parameters: Any,  # [R, PARAMETER_COLUMNS] parameter rows
     row: int,  # the joint's row
-    state: wp.array2d[
-        float
-    ],  # [R, STATE_COLUMNS] state rows; the play of the joint's row is written
+    state: wp.array2d[float],  # [R, STATE_COLUMNS] state rows; the joint's play is written
 ):
     """Put the play where a joint at rest has it, which depends on how it came there.
 

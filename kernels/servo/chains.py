@@ -215,35 +215,23 @@ def rollout_kernel(size: int) -> wp.Kernel:
     def rollout(
         # In:
         samples: Samples,  # what was recorded
-        first_sample: wp.array[
-            int
-        ],  # [R] row of ``samples`` where each rollout's trajectory begins
+        first_sample: wp.array[int],  # [R] row of ``samples`` where a rollout's trajectory begins
         sample_count: wp.array[int],  # [R] rows of each trajectory
         first_output: wp.array[int],  # [R] row of ``predicted`` where each rollout begins
         stream: wp.array[int],  # [R] number of each trajectory's random stream
-        start: wp.array2d[
-            float
-        ],  # [R, n] positions measured at the start, where the joints rest [rad]
-        wanted: wp.array[
-            int
-        ],  # [R] joint whose positions are kept, in column 0; -1 for all, each in its own
-        slot: wp.array[
-            int
-        ],  # [n] place of each joint in the finger, which is its column of the coupling
+        start: wp.array2d[float],  # [R, n] positions measured at the start, at rest [rad]
+        wanted: wp.array[int],  # [R] joint whose positions are kept, in column 0; -1: all
+        slot: wp.array[int],  # [n] place of each joint in the finger: its column of coupling
         lower: wp.array[float],  # [n] lower stops [rad]
         upper: wp.array[float],  # [n] upper stops [rad]
         effort: wp.array[float],  # [n] largest torques of the drives [N m]
         bodies: int,  # 1 if the links have mass, 0 if each joint is its own inertia
         links: links_of_size(size),  # the links, if they have mass
-        parameters: wp.array2d[
-            float
-        ],  # [R n, PARAMETER_COLUMNS] parameter rows by rollout and joint
+        parameters: wp.array2d[float],  # [R n, PARAMETER_COLUMNS] rows by rollout and joint
         dt: float,  # time step [s]
         # Out:
         state: wp.array3d[float],  # [R, n, STATE_COLUMNS] working memory
-        predicted: wp.array2d[
-            float
-        ],  # [S', n] positions as the servo reports them, or [S', 1] [rad]
+        predicted: wp.array2d[float],  # [S', n] positions as the servo reports, or [S', 1] [rad]
     ):
         """Simulate trajectories with parameter sets. Launch: [R]."""
         run = wp.tid()

@@ -71,8 +71,8 @@ def send_command_kernel(
 
     The commands of a hand go out together, so its joints share one draw of the jitter and one of
     the loss. Commands arrive in the order in which they were sent. What a joint is told at a time
-    acts from
-    there on, which is the middle of a physics step: velocities are those between two positions.
+    acts from there on, which is the middle of a physics step: velocities are those between two
+    positions.
     """
     world = wp.tid()
     joints = transit_count.shape[1]
@@ -168,9 +168,7 @@ def drive_joint_kernel(
     # Model:
     parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     first: wp.array[int],  # [D] first joint of each joint's finger
-    inverse_inertia: wp.array2d[
-        float
-    ],  # [N, *] diagonal of the inverse inertia matrix [1/(kg m^2)]
+    inverse_inertia: wp.array2d[float],  # [N, *] diagonal of the inverse inertia [1/(kg m^2)]
     effort: wp.array2d[float],  # [N, *] largest torques of the drives [N m], which the solver keeps
     # In:
     dt: float,  # physics time step [s]

@@ -1,8 +1,8 @@
 """Actions of the policy to joint targets, and the actuator limits that the solver does not apply.
 
 Order in a control step: :func:`apply_action_kernel` once, then :func:`limit_joint_velocity_kernel`
-after every physics step, then :func:`joint_effort_kernel` once for the energy reward.
-Arrays ``[N, *]`` hold at least D columns, the D hand joints first.
+after every physics step, then :func:`joint_effort_kernel` once for the energy reward. Arrays ``[N,
+*]`` hold at least D columns, the D hand joints first.
 """
 
 import warp as wp

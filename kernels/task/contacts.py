@@ -11,9 +11,7 @@ def pair_force_kernel(
     contact_count: wp.array[int],  # [1] number of contacts in use over all worlds
     contact_world: wp.array[int],  # [C] world of each contact
     contact_geom: wp.array[wp.vec2i],  # [C] the two geoms of each contact
-    contact_row: wp.array2d[
-        int
-    ],  # [C, R] constraint rows of each contact; -1 where it is not active
+    contact_row: wp.array2d[int],  # [C, R] constraint rows of each contact; -1: not active
     row_force: wp.array2d[float],  # [N, rows] force of each constraint row [N]
     geom_kind: wp.array2d[int],  # [N, G] kind of each geom
     kind_a: int,  # first kind

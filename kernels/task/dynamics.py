@@ -40,9 +40,7 @@ def dynamics_kernel(
     # In:
     kp_in: wp.array2d[float],  # [N, D] stiffness [N m/rad]
     kd_in: wp.array2d[float],  # [N, D] damping [N m s/rad]
-    servo_in: wp.array2d[
-        float
-    ],  # [N D, P] rows of servo parameters; no rows where there is no servo
+    servo_in: wp.array2d[float],  # [N D, P] rows of servo parameters; none without a servo
     hand_friction_in: wp.array[float],  # [N] friction coefficient of the hand
     object_friction_in: wp.array[float],  # [N] that of the object
     table_friction_in: wp.array[float],  # [N] that of the table

@@ -16,9 +16,7 @@ def redraw_mask_kernel(
     reset_in: wp.array[wp.int32],  # [N] 1 where a world resets in this step
     interval: int,  # control steps for which drawn dynamics are kept at least
     # In/Out:
-    age: wp.array[
-        wp.int32
-    ],  # [N] control steps since the last draw; counted here, zeroed where selected
+    age: wp.array[wp.int32],  # [N] control steps since the last draw; counted, or zeroed
     # Out:
     mask_out: wp.array[wp.int32],  # [N] 1 where dynamics are to be drawn anew
 ):
@@ -37,9 +35,7 @@ def write_friction_kernel(
     shape_world: wp.array[wp.int32],  # [S] world of each shape
     shape_kind: wp.array[wp.int32],  # [S] kind of each shape
     nominal: wp.array[float],  # [S] friction of each shape before randomisation
-    table_share: wp.array[
-        float
-    ],  # [N] share of the table's friction in the pair's; 1: it is the pair's
+    table_share: wp.array[float],  # [N] share of the table's friction in the pair's; 1: all
     nominal_hand: float,  # friction of the hand that ``hand_friction`` replaces
     kind_table: int,  # kind of the table
     kind_object: int,  # kind of the object's parts
@@ -84,9 +80,7 @@ def write_object_force_kernel(
     # In:
     force_in: wp.array[wp.vec3],  # [N] force on the object, world frame [N]
     # Out:
-    body_force_out: wp.array2d[
-        wp.spatial_vector
-    ],  # [N, B] force and torque [N, N m], the object's alone
+    body_force_out: wp.array2d[wp.spatial_vector],  # [N, B] force, torque [N, N m], of the object
 ):
     """Write a force at the object's centre of mass, and what carries a part of its weight.
 

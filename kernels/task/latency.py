@@ -21,9 +21,7 @@ class StateArrays:
     measured_q: wp.array2d[float]  # [N, *] hand joints as their encoders report them [rad]
     measured_qd: wp.array2d[float]  # [N, *] velocities likewise [rad/s]
     joint_q: wp.array2d[float]  # [N, D + 7] hand joints [rad], object position [m] and quaternion
-    joint_qd: wp.array2d[
-        float
-    ]  # [N, D + 6] hand joints [rad/s], object linear and angular velocity
+    joint_qd: wp.array2d[float]  # [N, D + 6] joints [rad/s], object linear and angular velocity
     body_q: wp.array2d[wp.transform]  # [N, B] link poses in the world frame
     body_qd: wp.array2d[wp.spatial_vector]  # [N, B] link velocities in the world frame
 
@@ -136,12 +134,8 @@ def recall_state_kernel(
     physics_dt: float,  # time between two rows [s]
     jitter: wp.array[float],  # [1] most that the object is seen later still, drawn in each call [s]
     # In:
-    latency_in: wp.array[
-        float
-    ],  # [N] how late each object is seen [s], with jitter at most (L - 1) steps
-    encoder_latency_in: wp.array[
-        float
-    ],  # [N] how late joints and fingertips are seen [s], likewise
+    latency_in: wp.array[float],  # [N] how late each object is seen [s], at most (L - 1) steps
+    encoder_latency_in: wp.array[float],  # [N] how late joints and tips are seen [s], likewise
     head_in: wp.array[int],  # [N] slot written last
     ring_in: wp.array2d[float],  # [N L, C] past states
     # In/Out:

@@ -45,9 +45,7 @@ class ObservationParams:
     velocity_scale: float  # factor on joint velocities and on the object's angular velocity
     noise_mean: float  # mean of the noise on measured values, in their units
     noise_std: float  # standard deviation of that noise, independent in every value and step
-    file_axes: (
-        float  # whether orientations in the axes of the object's file are seen: 1, or 0 for zeros
-    )
+    file_axes: float  # 1: orientations in the axes of the object's file are seen; 0: zeros
     canonical: float  # whether orientations and the rotation between them are canonical: 1 or 0
 
 
@@ -85,14 +83,10 @@ def teacher_observation_kernel(
     # In:
     measured_q_in: wp.array2d[float],  # [N, *] positions of the hand's joints as reported [rad]
     measured_qd_in: wp.array2d[float],  # [N, *] velocities of the hand's joints likewise [rad/s]
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
     body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
-    body_qd_in: wp.array2d[
-        wp.spatial_vector
-    ],  # [N, B] link velocities: of the centre of mass, angular
+    body_qd_in: wp.array2d[wp.spatial_vector],  # [N, B] link velocities: mass centre, angular
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     smoothed_in: wp.array2d[float],  # [N, D] previous (smoothed) action
     observation_offset_in: wp.array2d[float],  # [N, O] constant error of each measured value

@@ -20,9 +20,7 @@ def draw_pose_error_kernel(
     # In/Out:
     rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    error_out: wp.array[
-        wp.transform
-    ],  # [N] displacement, rotation about the object's origin, world frame
+    error_out: wp.array[wp.transform],  # [N] displacement, turn about the object's origin, world
 ):
     """Draw the error of the masked worlds, of uniform direction and axis. Launch: [N]."""
     world = wp.tid()
@@ -39,12 +37,8 @@ def draw_pose_error_kernel(
 @wp.kernel
 def mistake_pose_kernel(
     # In:
-    error_in: wp.array[
-        wp.transform
-    ],  # [N] displacement d and rotation r of each object, world frame
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position p [m] and quaternion q
+    error_in: wp.array[wp.transform],  # [N] displacement d and rotation r of each object, world
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object position p [m], quaternion q
     # Out:
     joint_q_out: wp.array2d[float],  # [N, D + 7] the same as it is believed
 ):

@@ -79,9 +79,7 @@ def draw_dynamics_kernel(
 @wp.kernel
 def draw_servo_kernel(
     # Model:
-    ranges: wp.array2d[
-        wp.vec2
-    ],  # [D, P] range of each parameter of each joint; equal ends draw nothing
+    ranges: wp.array2d[wp.vec2],  # [D, P] range of each joint's parameters; equal ends: not drawn
     # In:
     mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     kp_in: wp.array2d[float],  # [N, D] stiffness drawn for the world [N m/rad]
@@ -89,9 +87,7 @@ def draw_servo_kernel(
     # In/Out:
     rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    parameters_out: wp.array2d[
-        float
-    ],  # [N D, P] rows of parameters (:mod:`vd.kernels.servo.actuators`)
+    parameters_out: wp.array2d[float],  # [N D, P] rows (:mod:`vd.kernels.servo.actuators`)
 ):
     """Draw the servo model of the joints of the masked worlds, each number for itself. Launch: [N].
 

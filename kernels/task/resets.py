@@ -33,9 +33,7 @@ class GoalParams:
     """How goals are drawn; an array of length 1 in device memory."""
 
     max_angle: float  # largest angle between object and goal [rad]; all of SO(3) at >= pi
-    about_vertical: (
-        int  # 1 if goals only turn it about the vertical, uniform in the angle; 0: any axis
-    )
+    about_vertical: int  # 1: goals turn it about the vertical, uniform in the angle; 0: any axis
 
 
 @wp.kernel
@@ -48,14 +46,10 @@ def episode_kernel(
     # In/Out:
     step_count: wp.array[int],  # [N] control steps since the reset
     goal_steps: wp.array[int],  # [N] control steps since the goal was given
-    counts: wp.array[
-        float
-    ],  # [3] goals ended, goals reached, objects lost, of all worlds; added to
+    counts: wp.array[float],  # [3] goals ended, goals reached, objects lost, of all; added to
     # Out:
     timed_out_out: wp.array[int],  # [N] 1 where the episode ends only by its length
-    done_out: wp.array[
-        int
-    ],  # [N] 1 where the return ends for the learner: success, fall or time-out
+    done_out: wp.array[int],  # [N] 1 where the return ends for the learner, time-outs too
     reset_out: wp.array[int],  # [N] 1 where the world is to be reset
     new_goal_out: wp.array[int],  # [N] 1 where only the goal is to be drawn anew
 ):
@@ -91,9 +85,7 @@ def reset_kernel(
     reset_q: wp.array[float],  # [D] hand joints after a reset [rad]
     start_params: wp.array[StartParams],  # [1] start of the object
     goal_params: wp.array[GoalParams],  # [1] draw of the goal
-    rest_poses: wp.array2d[
-        wp.transform
-    ],  # [N, K] poses at rest of each world's object; K = 0: none
+    rest_poses: wp.array2d[wp.transform],  # [N, K] poses at rest of a world's object; K = 0: none
     # In:
     reset_in: wp.array[int],  # [N] 1 where the world is reset
     new_goal_in: wp.array[int],  # [N] 1 where only the goal is drawn anew
@@ -111,9 +103,7 @@ def reset_kernel(
     goal_steps_out: wp.array[int],  # [N] control steps since the goal was given
     goal_quat_out: wp.array[wp.quat],  # [N] goal orientation
     previous_error_out: wp.array[float],  # [N] rotation error to the new goal [rad]
-    env_mask_out: wp.array[
-        wp.bool
-    ],  # [N + 1] who is reset, for Newton; the last, of no world, stays
+    env_mask_out: wp.array[wp.bool],  # [N + 1] who is reset, for Newton; the last stays
 ):
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 

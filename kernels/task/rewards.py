@@ -46,9 +46,7 @@ class RewardParams:
     height_limit: float  # world z above which a fingertip is too high [m]
     progress: float  # coefficient on the decrease of the rotation error [1/rad]; not in the paper
     lift: float  # coefficient on the object's clearance over ``lift_height``, at most 1; not in the paper
-    lift_height: (
-        float  # clearance of the object's lowest point from which more is worth nothing [m]
-    )
+    lift_height: float  # clearance of its lowest point from which more is worth nothing [m]
     scale: float  # factor on the sum of all terms
 
 
@@ -57,16 +55,12 @@ def reward_kernel(
     # Model:
     params: wp.array[RewardParams],  # [1] coefficients
     # In:
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
     tip_pos_in: wp.array2d[wp.vec3],  # [N, G] fingertip positions, world frame [m]
     effort_in: wp.array2d[float],  # [N, D] joint torques [N m]
     table_force_in: wp.array[float],  # [N] magnitude of the object's force on the table [N]
-    clearance_in: wp.array[
-        float
-    ],  # [N] height of the object's lowest point above the table's top [m]
+    clearance_in: wp.array[float],  # [N] height of the object's lowest point over the table [m]
     rotation_error_in: wp.array[float],  # [N] angle between object and goal [rad]
     success_in: wp.array[int],  # [N] 1 where the goal is reached
     fell_in: wp.array[int],  # [N] 1 where the object is lost
@@ -74,9 +68,7 @@ def reward_kernel(
     previous_error: wp.array[float],  # [N] rotation error of the last step [rad]
     # Out:
     reward_out: wp.array[float],  # [N] reward
-    terms_out: wp.array2d[
-        float
-    ],  # [N, 9] terms with their coefficients, without scale, columns REWARD_TERMS
+    terms_out: wp.array2d[float],  # [N, 9] terms times coefficients, without scale: REWARD_TERMS
 ):
     """Reward of the state after a control step. Launch: [N], after the success kernel.
 

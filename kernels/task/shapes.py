@@ -62,14 +62,10 @@ def surface_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     first_column: int,  # column of the first value
     # In:
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
     # Out:
-    observation_out: wp.array2d[
-        float
-    ],  # [N, O] world vectors [SHAPE_UNIT_M], three columns a finger
+    observation_out: wp.array2d[float],  # [N, O] world vectors [SHAPE_UNIT_M], 3 columns a finger
 ):
     """Vector from each fingertip to the nearest point of the object's surface. Launch: [N, G]."""
     world, finger = wp.tid()
@@ -113,9 +109,7 @@ def extent_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     first_column: int,  # column of the first value
     # In:
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     # Out:
     observation_out: wp.array2d[float],  # [N, O] E columns now and E at the goal
@@ -144,9 +138,7 @@ def clearance_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     table_top: float,  # height of the table's top, world frame [m]
     # In:
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     # Out:
     clearance_out: wp.array[float],  # [N] height [m], negative below the top
 ):

@@ -40,9 +40,7 @@ def object_pose(world: int, joints: int, joint_q: wp.array2d[float]) -> wp.trans
 def begin_spin_kernel(
     # In:
     mask: wp.array[wp.int32],  # [N] 1 where an episode begins
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     joints: int,  # D
     # Out:
     before_out: wp.array[wp.transform],  # [N] pose of the object; written where masked, as below
@@ -61,9 +59,7 @@ def spin_kernel(
     params: wp.array[SpinParams],  # [1] coefficients
     start_q: wp.array[float],  # [D] joints at the start of an episode [rad]
     # In:
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     effort_in: wp.array2d[float],  # [N, D] joint torques [N m]
     first: int,  # column of the first of these terms
     # In/Out:

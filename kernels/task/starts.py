@@ -56,9 +56,7 @@ class OpenHand:
     pose: wp.array[wp.transform]  # [S] pose of each shape
     half: wp.array[wp.vec3]  # [S] half extents without the rounding [m]
     radius: wp.array[float]  # [S] radius of the rounding [m]
-    reach: wp.array[
-        float
-    ]  # [S] distance from its centre within which a sample counts as inside, at most [m]
+    reach: wp.array[float]  # [S] distance from its centre to what counts as inside, at most [m]
 
 
 @wp.func
@@ -81,13 +79,9 @@ def start_depth_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     # In:
     reset_in: wp.array[int],  # [N] 1 where the world is reset; others are left as they are
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     # In/Out:
-    depth: wp.array2d[
-        float
-    ],  # [N, C] depth beyond what is allowed [m], 0 before; raised to the deepest
+    depth: wp.array2d[float],  # [N, C] depth beyond what is allowed [m], 0 before; raised
 ):
     """How deep the object would start in hand or table at each place. Launch: [N, C, CHUNKS]."""
     world, place, chunk = wp.tid()

@@ -40,9 +40,7 @@ def success_kernel(
     # Model:
     params: wp.array[SuccessParams],  # [1] thresholds
     # In:
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     smoothed_in: wp.array2d[float],  # [N, D] smoothed action
@@ -57,8 +55,8 @@ def success_kernel(
     """Success and fall of the state after a control step. Launch: [N].
 
     Success: the rotation error and all speeds are at most their thresholds, without contact with
-    the table
-    where that is asked for. Fall: the object's distance from fall_center is at least fall_distance.
+    the table where that is asked for. Fall: the object's distance from fall_center is at least
+    fall_distance.
     """
     world = wp.tid()
     limits = params[0]

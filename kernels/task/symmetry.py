@@ -3,8 +3,7 @@
 World frame (z up), quaternions xyzw. V frames: frame k < F is the environment turned about the
 vertical by k / F of a full turn, with the F fingers renamed. A policy that always takes the frame
 in which the axis of the wanted rotation lies in the same sector has an F-th of the goals to learn.
-A hand that is its own mirror
-image has as many frames in the mirror: half of that.
+A hand that is its own mirror image has as many frames in the mirror: half of that.
 """
 
 import warp as wp
@@ -23,9 +22,7 @@ def choose_frame_kernel(
     # In:
     reset_in: wp.array[int],  # [N] 1 where the world was reset
     new_goal_in: wp.array[int],  # [N] 1 where only the goal is new
-    joint_q_in: wp.array2d[
-        float
-    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[float],  # [N, D + 7] joints [rad], object's position [m], quaternion
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     # In/Out:
     frame: wp.array[int],  # [N] symmetry frame of each environment
@@ -35,9 +32,8 @@ def choose_frame_kernel(
     Launch: [N].
 
     It is the frame that turns the axis of the rotation to the goal nearest to one fixed direction.
-    Chosen
-    once for a goal: an axis of small rotations wanders, and fingers would change their parts with
-    it.
+    Chosen once for a goal: an axis of small rotations wanders, and fingers would change their parts
+    with it.
     """
     world = wp.tid()
     if reset_in[world] == 0 and new_goal_in[world] == 0:

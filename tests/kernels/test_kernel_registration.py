@@ -46,10 +46,11 @@ class Scene:
         places = self.half[:, None, None, None, None] * grid
         apart = places[..., None, :] - self.samples[:, None, None, None]
         self.from_samples = np.linalg.norm(apart, axis=-1).min(axis=-1)
+        # Negative inside, as of a mesh.
         self.places, self.distance = (
             places,
             self.from_samples - 0.02,
-        )  # negative inside, as of a mesh
+        )
         self.seen = rng.uniform(-0.1, 0.1, (self.worlds, SEEN, 3))
         self.count = rng.integers(0, SEEN + 1, self.worlds)
         self.row_world = rng.permutation(self.worlds)[: rng.integers(1, self.worlds + 1)]

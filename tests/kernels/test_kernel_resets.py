@@ -45,9 +45,8 @@ def end_episodes(device, success, fell, before, *, age, ends):
 
 @pytest.mark.parametrize("ends", [0, 1])
 def test_episode_ends_as_stated_in_every_case(device, ends):
-    cases = list(
-        itertools.product([0, 1], [0, 1], [3, 8, 9, 20])
-    )  # success, fell, steps before; limit 10
+    # Success, fell, steps before; limit 10.
+    cases = list(itertools.product([0, 1], [0, 1], [3, 8, 9, 20]))
     success, fell, before = (np.array(column) for column in zip(*cases, strict=True))
     count = len(cases)
     out = end_episodes(device, success, fell, before, age=np.full(count, 8), ends=ends)

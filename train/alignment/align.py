@@ -166,7 +166,7 @@ class AlignTrainer(SupervisedLoop):
 
     def _step(self, done: float) -> dict[str, Tensor]:
         pairs = self.pairs()
-        near = [self.network.neighbours(cloud) for cloud in (pairs.goal, pairs.seen)]
+        near = list(map(self.network.neighbours, (pairs.goal, pairs.seen)))
         pairs = self.searched(pairs, near)
         with self._half:
             residual = self.network(pairs.goal, pairs.seen, near)
@@ -207,7 +207,8 @@ class AlignTrainer(SupervisedLoop):
     def _shared_state(self) -> dict[str, Any]:
         return super()._shared_state() | {"spec": to_dict(self.spec)}
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Free the environments."""
         if self.looks is not None:
             self.looks.close()
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vd.policy.agents import find_policy
@@ -13,29 +12,30 @@ from vd.train.stages import StagedTraining, run_stage
 if TYPE_CHECKING:
     from vd.train.alignment.align import AlignTrainer
 
-HELP = """Train alignment: the network by which a teacher acts on what a camera sees, without a mesh.
+STAGES = """Train alignment: the network by which a teacher acts on what a camera sees, without a mesh.
 
 Stage 0 learns to turn a goal's cloud onto what a camera sees, from clouds that are made; stage 1 also from
-what it sees in simulation. Flags start from --preset and --stage, or with --resume from the run's
-config.json; the network's sizes from --init. Short forms: --objects, --num-envs and --seed stand for
---task.objects and so on, --validate for --task.validation. Ctrl-C saves. vd-train tracker --alignment makes
-a policy of what was learned."""
+what it sees in simulation. vd-train tracker --alignment makes a policy of what was learned."""
 
 
-def begin_from(base: AlignmentTrainCfg, init: str | None) -> AlignmentTrainCfg:
-    """``base`` with the network to begin from: its sizes, and its camera."""
+def _stage_before(base: AlignmentTrainCfg) -> str | None:
+    """The network of stage 0, or the installed one, for stage 1."""
     from vd.policy.bundle import read_policy
-    from vd.train.alignment.network import default_network, open_network
+    from vd.train.alignment.network import default_network
 
-    if init is None:
-        if base.stage != SIMULATED:
-            return base
-        teacher = read_policy(find_policy(str(base.teacher)))
-        init = default_network(teacher.hand, base.preset)
+    if base.stage != SIMULATED:
+        return None
+    teacher = read_policy(find_policy(str(base.teacher)))
+    return default_network(teacher.hand, base.preset)
+
+
+def _as_in(base: AlignmentTrainCfg, init: str) -> AlignmentTrainCfg:
+    """``base`` with a network's sizes and camera."""
+    from vd.train.alignment.network import open_network
+
     network, camera = open_network(init)
     assert camera is None or len(camera) == 7
-    align = replace(base.align, network=network.cfg)
-    return replace(base, init=Path(init), align=align, camera=camera)
+    return replace(base, align=replace(base.align, network=network.cfg), camera=camera)
 
 
 def _build(cfg: AlignmentTrainCfg, say: Callable[[str], object]) -> "AlignTrainer":
@@ -47,10 +47,11 @@ def _build(cfg: AlignmentTrainCfg, say: Callable[[str], object]) -> "AlignTraine
 
 ALIGNMENT = StagedTraining(
     name="alignment",
-    help=HELP,
+    stages=STAGES,
     presets=PRESETS,
     smoke=smoke,
-    begin_from=begin_from,
+    stage_before=_stage_before,
+    as_in=_as_in,
     build=_build,
     result=ALIGNMENT_NAME,
 )

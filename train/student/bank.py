@@ -50,23 +50,24 @@ class ShapeBank:
     ) -> None:
         self._meshes = centred_points(objects, max(MESH_POINTS, points), device)
         self._oldest = 0
-        self._shapes = torch.empty((count, points, 6), dtype=torch.half, device=device)
+        self.shapes = torch.empty((count, points, 6), dtype=torch.half, device=device)
+        """Points [m] and normals [count, P, 6]."""
         self.renew(count)
 
     def renew(self, count: int) -> None:
         """Replace the oldest ``count`` shapes."""
-        size, points = self._shapes.shape[:2]
+        size, points = self.shapes.shape[:2]
         while count > 0:
             some = min(SHAPES_AT_ONCE, count)
             half = (some + 1) // 2
             made = made_shapes(half, points, self._meshes.device)
             shapes = torch.cat([made, mesh_shapes(self._meshes, some - half, points)])
             rows = (self._oldest + torch.arange(some, device=shapes.device)) % size
-            self._shapes[rows] = shapes.half()
+            self.shapes[rows] = shapes.half()
             self._oldest = (self._oldest + some) % size
             count -= some
 
     def draw(self, count: int) -> Tensor:
         """Points [m] and normals of shapes drawn at random [count, P, 6]."""
-        rows = torch.randint(len(self._shapes), (count,), device=self._shapes.device)
-        return self._shapes[rows]
+        rows = torch.randint(len(self.shapes), (count,), device=self.shapes.device)
+        return self.shapes[rows]

@@ -179,7 +179,7 @@ def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
         place: Number of the body in its shape, 0 for the first.
         device: Torch device.
     """
-    low, high = (math.log(value) for value in HALF_AXES)
+    low, high = map(math.log, HALF_AXES)
     half = uniform(low, high, count, 3, device=device).exp() * (1.0 if place else FIRST_GROWN)
     exponents = uniform(*ROUND_EXPONENTS, count, 2, device=device)
     boxes = torch.rand((count, 2), device=device) < 0.5
@@ -195,7 +195,7 @@ def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
     )
 
 
-def _parts(count: int, device: torch.device) -> tuple[list[Bodies], list[Tensor], Tensor]:
+def draw_parts(count: int, device: torch.device) -> tuple[list[Bodies], list[Tensor], Tensor]:
     """The bodies of shapes, their points, normals and areas [K, P, 3 + 3 + 1], and how many count [K].
 
     Each body is about a point of one before it. Half have the first one's axes, as things that are
@@ -222,7 +222,7 @@ def _parts(count: int, device: torch.device) -> tuple[list[Bodies], list[Tensor]
 
 def unions(count: int, points: int, device: torch.device) -> Tensor:
     """Unions of bodies, some hollowed, at their own size: points and normals [count, points, 6]."""
-    bodies, samples, number = _parts(count, device)
+    bodies, samples, number = draw_parts(count, device)
     first = bodies[0]
     hollowed = (torch.rand(count, device=device) < HOLLOWS) & ~first.ring
     narrow = torch.tensor([WALL, WALL, 1.0], device=device)

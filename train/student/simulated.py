@@ -1,9 +1,9 @@
 """Stages 1 and 2: the student acts in simulation, and the teacher says what it would have done (DAgger).
 
 Where an episode begins the student is told about where the object is, and follows it from there. In
-stage 1 it is told complete surfaces where the objects truly are, and nothing is
-rendered; in stage 2 what a depth camera sees. Rollouts hold what clouds are made of rather than
-clouds (0.4 kB a step; with a camera also its points). T steps, N environments, D joints, K points.
+stage 1 it is told complete surfaces where the objects truly are, and nothing is rendered; in stage
+2 what a depth camera sees. Rollouts hold what clouds are made of rather than clouds (0.4 kB a step;
+with a camera also its points). T steps, N environments, D joints, K points.
 """
 
 import math
@@ -69,7 +69,8 @@ class SimulatedSequences:
         points = cfg.clouds.points
         goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
         self.goals = self._scale * goals
-        self._shapes = surfaces[:, points:]
+        self.shapes = surfaces[:, points:]
+        """Points of each object that a look is drawn of [K, P, 6]."""
         self._all = wp.ones(env.num_envs, dtype=wp.int32, device=env.env.device)
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
@@ -214,8 +215,8 @@ class SimulatedSequences:
     def _complete(self, pose: Tensor, rows: Tensor) -> Tensor:
         """Points all over the objects of environments ``rows`` at poses [R, 7], with noise [R, K, 3]."""
         clouds = self._cfg.clouds
-        order = torch.randperm(self._shapes.shape[1], device=pose.device)[: clouds.points]
-        shapes = self._scale[rows] * self._shapes[self._object[rows]][:, order]
+        order = torch.randperm(self.shapes.shape[1], device=pose.device)[: clouds.points]
+        shapes = self._scale[rows] * self.shapes[self._object[rows]][:, order]
         points = carried(shapes, quaternion_matrices(pose[:, 3:]), pose[:, None, :3])
         return points + clouds.noise_m * torch.randn_like(points)
 

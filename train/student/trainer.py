@@ -116,7 +116,8 @@ class StudentTrainer(SupervisedLoop):
             self.acting.hidden = state["hidden"]
             self.acting.lost = state["lost"]
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Free the environments."""
         self.source.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:

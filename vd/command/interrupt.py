@@ -96,9 +96,8 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
             _show_what_can_be_shown()
             given = args[0] if args and isinstance(args[0], Sequence) else sys.argv[1:]
             if given and not {"-h", "--help", "--help-all"} & set(given):
-                print(
-                    f"{name}: starting", file=sys.stderr, flush=True
-                )  # what it imports takes seconds
+                # What it imports takes seconds.
+                print(f"{name}: starting", file=sys.stderr, flush=True)
             warnings.formatwarning = format_warning
             with _terminated():
                 try:
@@ -149,9 +148,8 @@ def handled(
 ) -> Iterator[None]:
     """Have signals call ``handler``, but for a SIGHUP that is ignored (nohup)."""
     before = {}
-    if (
-        threading.current_thread() is threading.main_thread()
-    ):  # signals belong to it; elsewhere are none
+    # Signals belong to it; elsewhere are none.
+    if threading.current_thread() is threading.main_thread():
         for number in numbers:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 before[number] = signal.signal(number, handler)

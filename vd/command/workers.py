@@ -46,8 +46,7 @@ def one_thread_without_gpu(device: str) -> None:
     """Keep torch to one thread where it computes on a CPU, unless OMP_NUM_THREADS says how many.
 
     A second thread gains networks as small as ours little. Where cores are shared it costs them up
-    to
-    tenfold: all threads wait for the one that has no core.
+    to tenfold: all threads wait for the one that has no core.
     """
     import torch
 

@@ -145,11 +145,10 @@ class ObservationCfg:
     view: View = "world"
     """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned
     about the vertical from finger to finger, and the fingers renamed, so that the axis of the
-    wanted rotation lies in
-    one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the
-    mirror too,
-    where the wanted rotation would be clockwise from above: half of that. The hand must be its own
-    mirror image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
+    wanted rotation lies in one sector: an F-th of the goals to learn. The fingers must be spaced
+    evenly. mirrored: in the mirror too, where the wanted rotation would be clockwise from above:
+    half of that. The hand must be its own mirror image, as dclaw3 is; of dclaw4 all fingers lean
+    the same way round."""
     file_axes: bool = True
     """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud
     shows which they are; a camera shows the rotation from one to the other alone. Ours: without
@@ -412,14 +411,12 @@ class RandomisationCfg:
     """
     effects: MutableMapping[str, tuple[float, float]] = field(default_factory=dict)
     """Effects of servos to draw for every joint in each episode, by name and parameter:
-    command_delay.delay_s
-    0 0.04 draws a delay of up to 40 ms. Those given are all: others of --init or a preset go. They
-    replace what a hand layer says about the same parameter. Delays are of the bus: all joints of an
-    environment have the same share of their range."""
+    command_delay.delay_s 0 0.04 draws a delay of up to 40 ms. Those given are all: others of --init
+    or a preset go. They replace what a hand layer says about the same parameter. Delays are of the
+    bus: all joints of an environment have the same share of their range."""
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the object's state is that the policy sees [s], drawn for each episode, to the
-    nearest physics
-    step: a camera and its loop. Rewards and success are of the true state."""
+    nearest physics step: a camera and its loop. Rewards and success are of the true state."""
     observation_jitter_s: float = 0.0
     """By how much more the object's state is old in a step, uniform from 0 to this [s]: images come
     at a rate of their own, and the newest is up to one period old (1/30 s of a D415)."""

@@ -61,7 +61,7 @@ class SeenState:
         self.arrays: list[Any] = present
         if not self.is_late:
             return
-        self.arrays = [wp.zeros_like(array) for array in present]
+        self.arrays = list(map(wp.zeros_like, present))
         d = state.num_joints
         f = state.num_fingers
         slots = math.ceil(longest / state.cfg.sim.physics_dt) + 1

@@ -23,9 +23,8 @@ def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[st
         "terms": sum(cfg.terms.values()),
         "dynamics": dynamics_size(joints) if told else 0,
         "present": state + shape if told else 0,
-        "critic_terms": sum(
-            cfg.critic_terms.values()
-        ),  # last, where a critic that goes on is widened
+        # Last, where a critic that goes on is widened.
+        "critic_terms": sum(cfg.critic_terms.values()),
     }
     return consecutive({name: size for name, size in sizes.items() if size})
 

@@ -120,7 +120,7 @@ class Randomiser:
             (value,), (low,), (high,) = item.contact[name]
             return (low, high) if usual[0] < usual[1] else (value, value)
 
-        return self._of_objects([of(item) for item in self._state.objects])
+        return self._of_objects(list(map(of, self._state.objects)))
 
     def _draw_masses(self) -> None:
         """Draw link and object masses, with which inertias scale, and where the objects' centres are."""
@@ -145,7 +145,7 @@ class Randomiser:
             model.body_inertia,
             model.body_inv_inertia,
         ]
-        self._own_inertial = [wp.clone(array) for array in self._inertial]
+        self._own_inertial = list(map(wp.clone, self._inertial))
         shift = state.cfg.randomisation.object_com_m
         if self.enabled and shift > 0.0:
             direction = np.random.default_rng(state.cfg.seed).normal(size=(n, 3))

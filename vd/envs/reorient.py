@@ -570,7 +570,7 @@ class ReorientEnv:
 
     def update_curriculum(self) -> dict[str, float]:
         """Move the levels by the success rate since the last call; returns numbers to log."""
-        ended, reached, dropped = (float(v) for v in self.goal_counts.numpy())
+        ended, reached, dropped = map(float, self.goal_counts.numpy())
         self.goal_counts.zero_()
         rate = reached / max(ended, 1.0)
         levels = next_levels(self.levels, rate, self._moving) if ended > 0 else self.levels

@@ -65,9 +65,8 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         saved = arrays[name]
         if saved.shape != array.numpy().shape:
             raise ValueError(
-                f"the saved environment has {name} of shape {saved.shape}, "
-                f"this one {array.numpy().shape}; "
-                "resume with the num_envs and hand of the checkpoint"
+                f"the saved environment has {name} of shape {saved.shape}, this one "
+                f"{array.numpy().shape}; resume with the num_envs and hand of the checkpoint"
             )
     if state["objects"] != _objects(task):
         raise ValueError(

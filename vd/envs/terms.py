@@ -7,14 +7,27 @@ A function takes the :class:`vd.envs.reorient.ReorientEnv` and gives a torch ten
 to it.
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 import warp as wp
 
 from vd.command.functions import named_function
 from vd.envs.cfg import ReorientCfg
-from vd.sim.simulator import CHECKED
+from vd.envs.observer import Observer
+from vd.sim.simulator import CHECKED, Simulator
+
+
+class TermEnv(Protocol):
+    """What is read of a :class:`vd.envs.reorient.ReorientEnv` here; functions read all of it."""
+
+    num_envs: int
+    device: str
+    sim: Simulator
+    observer: Observer
+    reward: Any
+    reward_terms: Any
+    reward_term_names: tuple[str, ...]
 
 
 class OwnTerms:
@@ -45,7 +58,7 @@ class OwnTerms:
         self._steps = 0
 
     @torch.no_grad()
-    def pay(self, env: Any) -> None:
+    def pay(self, env: TermEnv) -> None:
         """Add to the reward of a step what own terms give for the state before resets."""
         reward = wp.to_torch(env.reward)
         terms = wp.to_torch(env.reward_terms)
@@ -57,7 +70,7 @@ class OwnTerms:
             reward += self._scale * paid
 
     @torch.no_grad()
-    def observe(self, env: Any) -> None:
+    def observe(self, env: TermEnv) -> None:
         """Write own values of the present state into the observation, alike in every frame."""
         observer = env.observer
         first = {part: columns.start for part, columns in observer.parts.items()}
@@ -83,7 +96,7 @@ class OwnTerms:
                     f"the own term {name} gave a value that is not finite; mend the function"
                 )
 
-    def _value(self, env: Any, name: str, size: int) -> torch.Tensor:
+    def _value(self, env: TermEnv, name: str, size: int) -> torch.Tensor:
         """What a function gives [N, K]."""
         try:
             value = self._functions[name](env)
@@ -91,8 +104,10 @@ class OwnTerms:
             raise ValueError(
                 f"the own term {name} raised {type(error).__name__}: {error}"
             ) from error
-        shape: Any = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-        fits = shape in {(env.num_envs, size), (env.num_envs,) if size == 1 else None}
+        shape: object = type(value).__name__
+        if isinstance(value, torch.Tensor):
+            shape = tuple(value.shape)
+        fits = shape == (env.num_envs, size) or (size == 1 and shape == (env.num_envs,))
         if not fits or value.device != torch.device(env.device):
             where = f" on {value.device}" if fits else ""
             raise ValueError(

@@ -140,8 +140,8 @@ class EvalCfg(HandFlags, EpisodeFlags):
     command without it runs what is missing in --out and writes the page."""
     objects: tuple[str, ...] = ()
     """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts
-    one into a
-    group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
+    one into a group, which gets figures of its own: training=FOLDER held-out=FOLDER
+    symmetric=symmetric."""
     max_goal_angle: float = math.pi
     """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
     at_rest: tyro.conf.FlagCreatePairsOff[bool] = False

@@ -35,18 +35,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(cfg: EvalCfg) -> int:
-    from vd.evaluate.compare import compare
+    from vd.evaluate.compare import compare, open_agents
     from vd.evaluate.page import terminal_text, write_page
-    from vd.evaluate.spin import SPIN_FILE, any_spins, evaluate_spin
+    from vd.evaluate.spin import SPIN_FILE, evaluate_spin, spins
     from vd.evaluate.suite_run import run_suite
 
-    if any_spins(cfg):
-        print(f"{evaluate_spin(cfg).text()}\n{cfg.out / SPIN_FILE}")
+    policies = {} if cfg.suite else open_agents(cfg)
+    if any(map(spins, policies.values())):
+        print(f"{evaluate_spin(cfg, policies).text()}\n{cfg.out / SPIN_FILE}")
         return 0
     written = cfg.out / f"{cfg.suite_name}.json"
     page = cfg.out / f"{cfg.suite_name}.html"
     if cfg.suite is None:
-        result = compare(cfg)
+        result = compare(cfg, policies=policies)
         write_page(result, page)
     else:
         result = run_suite(cfg)

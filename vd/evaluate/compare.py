@@ -2,12 +2,14 @@
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd.command.device import resolve_device
 from vd.command.functions import named_function
 from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
@@ -31,8 +33,25 @@ ENVS_PLAN = 128
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
-def compare(cfg: EvalCfg, condition: str = "") -> "Result":
+def device_of(cfg: EvalCfg) -> str:
+    """Where an evaluation runs."""
+    return resolve_device("cpu" if cfg.engine == "mujoco" else cfg.device)
+
+
+def open_agents(cfg: EvalCfg) -> dict[str, Any]:
+    """The policies of an evaluation by name; None for an agent without a file."""
+    return {name: open_policy(name, device_of(cfg)) for name in cfg.agent_names}
+
+
+def compare(
+    cfg: EvalCfg, condition: str = "", policies: Mapping[str, Any] | None = None
+) -> "Result":
     """Run an evaluation, of a suite under ``condition``, and write its JSON into ``cfg.out``.
+
+    Args:
+        cfg: Its settings.
+        condition: Name of the suite's line.
+        policies: What :func:`open_agents` gave; None: they are opened here.
 
     Raises:
         ValueError: A setting, object set or policy cannot be used.
@@ -40,11 +59,9 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         vd.sim.simulator.SimulationError: Contacts were lost.
     """
     quiet_warp()
-    from vd.command.device import resolve_device
-
-    device = resolve_device("cpu" if cfg.engine == "mujoco" else cfg.device)
     # A file that cannot be used, or is of another hand, is told before the simulator is imported.
-    policies = {name: open_policy(name, device) for name in cfg.agent_names}
+    device = device_of(cfg)
+    policies = open_agents(cfg) if policies is None else policies
     for name, policy in policies.items():
         check_fits(name, policy, cfg.hand, cfg.hand_layer)
     import warp as wp
@@ -83,7 +100,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
             actor, agent = planning(actor, agent, env, cfg.seed)
         trace = run_episodes(cfg, env, actor, agent)
         for group, sets in groups.items():
-            chosen = [files.index(file) for file in set_files(sets)]
+            chosen = list(map(files.index, set_files(sets)))
             objects = [env.objects[number] for number in chosen]
             protocol = _protocol(cfg, task, sets, agent.sees)
             rows += judge(

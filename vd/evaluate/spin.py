@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,10 @@ import warp as wp
 from vd.command.config import to_dict
 from vd.command.files import write_json
 from vd.evaluate.cfg import EvalCfg
-from vd.evaluate.compare import actor_of, envs_for, task_of
+from vd.evaluate.compare import actor_of, device_of, envs_for, task_of
 from vd.evaluate.page import NOTHING, aligned
 from vd.evaluate.trace import act_in, drawn_rounds
-from vd.policy.agents import check_fits, open_policy
+from vd.policy.agents import check_fits
 
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
@@ -78,13 +79,8 @@ def spins(policy: Any) -> bool:
     return policy is not None and bool(policy.task["reward"].get("spin", {}).get("rate"))
 
 
-def any_spins(cfg: EvalCfg) -> bool:
-    """Whether a policy of an evaluation was trained to turn objects without a goal."""
-    return cfg.suite is None and any(spins(open_policy(name, "cpu")) for name in cfg.agent_names)
-
-
-def evaluate_spin(cfg: EvalCfg) -> SpinResult:
-    """Run an evaluation, and write its JSON into ``cfg.out``.
+def evaluate_spin(cfg: EvalCfg, policies: Mapping[str, Any]) -> SpinResult:
+    """Run an evaluation of what :func:`open_agents` gave, and write its JSON into ``cfg.out``.
 
     Agents without a file act in the task of the first policy.
 
@@ -92,7 +88,6 @@ def evaluate_spin(cfg: EvalCfg) -> SpinResult:
         ValueError: A policy has goals, or a setting is of goals.
     """
     from vd.assets_usd.objects.sets import set_files
-    from vd.command.device import resolve_device
     from vd.envs.reorient import ReorientEnv
 
     if cfg.consecutive or cfg.air_goals or cfg.in_air or cfg.plan:
@@ -100,8 +95,7 @@ def evaluate_spin(cfg: EvalCfg) -> SpinResult:
             "what spins has no goals and no table: leave out --consecutive, --air-goals, --in-air "
             "and --plan"
         )
-    device = resolve_device("cpu" if cfg.engine == "mujoco" else cfg.device)
-    policies = {name: open_policy(name, device) for name in cfg.agent_names}
+    device = device_of(cfg)
     with_goals = [name for name, policy in policies.items() if policy and not spins(policy)]
     if with_goals:
         raise ValueError(f"{with_goals[0]} turns objects to goals; evaluate it by itself")

@@ -5,8 +5,7 @@ episodes of each.
 
 Rates have t intervals on the log odds, with the jackknife's standard error (Efron and Stein 1981).
 Medians have the intervals of the share below them, turned into quantiles (Woodruff 1952). What the
-jackknife leaves
-out one at a time decides what they speak about:
+jackknife leaves out one at a time decides what they speak about:
 
 * ``object``: whole objects, each with all of its episodes. Episodes of one object are alike, so
   this is the honest choice for statements about objects of this kind; it needs some objects.

@@ -25,7 +25,7 @@ from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from vd.assets_usd.objects.contact_layer import CONTACT
+from vd.assets_usd.objects.contact_layer import CONTACT, contact_of
 from vd.assets_usd.objects.model import ObjectModel
 from vd.gap.chain import GRAVITY_M_S2
 from vd.logs.contact_recording import ContactMotion, ContactRecording, Kind
@@ -188,7 +188,7 @@ def _judge(
     ``besides``: deviation from parameters taken as known [P].
     """
     parameter = CONTACT[name]
-    nominal = parameter.of(item)
+    nominal = contact_of(item, name)
     resolution = parameter.resolution * (nominal if parameter.relative else np.ones(len(nominal)))
     value, deviation = _estimate(motions, len(nominal))
     deviation = np.hypot(deviation, besides)

@@ -38,7 +38,7 @@ class HandCloud:
         joints.axis = array(hand.joint_axis, wp.vec3)
         joints.parent_frame = array(hand.joint_parent_frame, wp.transform)
         joints.child_frame = array(hand.joint_child_frame, wp.transform)
-        self._joints = [joints, base, wp.transform(*(float(value) for value in hand.mount))]
+        self._joints = [joints, base, wp.transform(*map(float, hand.mount))]
 
     def pose(self, joint_q: wp.array, body_q: wp.array) -> None:
         """Write link poses in the world frame, shape [N, B], for positions [rad], shape [N, >= D]."""

@@ -1,10 +1,8 @@
 """The symmetry frames of a teacher that sees its goals in them, for those without a simulator.
 
 The simulator keeps a frame as long as a goal (:mod:`vd.envs.symmetry`). Here it is chosen anew in
-every step,
-from the rotation as it is known: a teacher acts as well so, and nothing has to be remembered. N
-hands, O
-values of the observation, D actions. World frame: z up; quaternions xyzw.
+every step, from the rotation as it is known: a teacher acts as well so, and nothing has to be
+remembered. N hands, O values of the observation, D actions. World frame: z up; quaternions xyzw.
 """
 
 from collections.abc import Callable

@@ -256,7 +256,7 @@ def _lerobot_joints(
         values.shape[1:] == (len(names),),
         f"{path}: {len(names)} names for values of shape {values.shape[1:]}",
     )
-    return values[:, [names.index(joint) for joint in joints]]
+    return values[:, list(map(names.index, joints))]
 
 
 def _lerobot_names(feature: Mapping[str, Any]) -> list[str]:

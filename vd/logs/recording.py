@@ -140,7 +140,7 @@ def write_recording(
         "joints": list(recording.joints),
         "servo": recording.servo,
         "encoder_resolution_rad": recording.encoder_resolution_rad,
-        "trajectories": [entry_of(trajectory) for trajectory in recording.trajectories],
+        "trajectories": list(map(entry_of, recording.trajectories)),
     }
     write_json(folder / "recording.json", header)
     return folder

@@ -83,9 +83,8 @@ class PlayViewer:
         due = time.monotonic()
         while self.viewer.is_running() and (steps is None or done < steps):
             done += self.update()
-            due = max(
-                due + period, time.monotonic() - period
-            )  # after a pause, do not hurry to catch up
+            # After a pause, do not hurry to catch up.
+            due = max(due + period, time.monotonic() - period)
             time.sleep(max(0.0, due - time.monotonic()))
 
     def update(self) -> bool:
@@ -105,7 +104,7 @@ class PlayViewer:
         self.viewer.begin_frame(shot.time_s)
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
-        self._status.content = status_html(shot)
+        self.status.content = status_html(shot)
         if isinstance(self.session, Session) and self.session.sees:
             self._eye.image = self.session.view()
         self.viewer.end_frame()
@@ -141,7 +140,8 @@ class PlayViewer:
         gui = self.viewer.server.gui
         session = self.session
         with gui.add_folder("Policy", order=-1.0):
-            self._status = gui.add_html(status_html(session.snapshot))
+            self.status = gui.add_html(status_html(session.snapshot))
+            """What the page says of the moment."""
             if len(session.object_names) > 1:
                 self._build_menu(session)
             new_goal = gui.add_button("New goal")

@@ -337,7 +337,7 @@ def _camera(hand: HandModel, spec: CameraSpec) -> dict[str, Any]:
 
 
 def _floats(values: Any) -> list[float]:
-    return [float(value) for value in values]
+    return list(map(float, values))
 
 
 _REMEDY = {

@@ -92,10 +92,9 @@ def calibrate(
 
     First that of the distance, with the paper's bound of the action norm, as headline figures have
     it; then one of the norm beside it. Only where nothing near is as still as the paper asks are
-    both chosen together.
-    Bounds are tried on a grid: distances up to twice the tolerance, and quantiles of the action
-    norms while the object is within it. Among equal success the rule that stops wrongly less often
-    wins, then the stricter one.
+    both chosen together. Bounds are tried on a grid: distances up to twice the tolerance, and
+    quantiles of the action norms while the object is within it. Among equal success the rule that
+    stops wrongly less often wins, then the stricter one.
 
     Args:
         predicted: Predicted distances after t steps [rad] [M, T + 1].

@@ -149,7 +149,10 @@ def check_for_others(path: Path) -> None:
 
 @dataclass(frozen=True)
 class List:
-    """Show the policies that commands know by name, and with --at those of a place."""
+    """Show the policies that commands know by name, and the objects that each was trained with.
+
+    With --at also those of a place.
+    """
 
     at: str | None = None
     """A folder, or hf://OWNER/NAME of Hugging Face."""
@@ -160,7 +163,9 @@ class List:
         for name, path in installed.items():
             contract = installed_contract(path)
             size = f"{path.stat().st_size / 1e6:5.1f} MB"
-            print(f"{name:<24} {contract.kind:<9} {contract.task['hand']:<10} {size}  installed")
+            low, high = contract.task["randomisation"]["object_scale"]
+            objects = f"{', '.join(contract.task['objects'])}, {low:g} to {high:g} times their size"
+            print(f"{name:<24} {contract.kind:<9} {contract.task['hand']:<10} {size}  {objects}")
         if self.at is None:
             return 0
         for name in names_at(self.at):

@@ -11,8 +11,7 @@ from vd.paper import PAPER
 
 BASELINE_M, FOCAL_PX = 0.055, 1024.2
 """Distance of the imagers of an Intel RealSense D415 [m] (D400 series data sheet), and their focal
-length
-[pixel] where disparities are found: 1280 pixels over 64 degrees."""
+length [pixel] where disparities are found: 1280 pixels over 64 degrees."""
 LATENCY_S = (1.0 / 30.0, 2.0 / 30.0)
 """Age of images at 30 Hz, as vd-deploy asks for [s]: one period to take and send, and up to one
 until it is read (an assumption; the data sheet gives none)."""
@@ -29,8 +28,7 @@ class DepthSensorCfg:
 
     disparity_std_px: float = 0.0
     """Noise of the disparity [pixel]; in depth it is z^2 / (focal length * baseline) times that.
-    Real cameras
-    of this kind: 0.05 to 0.1."""
+    Real cameras of this kind: 0.05 to 0.1."""
     disparity_step_px: float = 0.0
     """Rounding of the disparity [pixel]; the D400 series resolves 1/32."""
     shadow: bool = False

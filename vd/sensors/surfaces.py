@@ -64,7 +64,7 @@ class SurfaceSet:
         most = sizes[shape_mesh].max(axis=0)
         self.slot_shape = array(np.repeat(np.arange(self.num_shapes), most), wp.int32)
         """Shape of each thread of the ray casting, shape [K]."""
-        self.slot_index = array(np.concatenate([np.arange(n) for n in most]), wp.int32)
+        self.slot_index = array(np.concatenate(list(map(np.arange, most))), wp.int32)
         """Triangle of each thread within its mesh, shape [K]."""
 
 
@@ -84,7 +84,7 @@ def scene_surfaces(scene: Scene) -> SurfaceSet:
             meshes.append(surface)
         return known[key]
 
-    links = [index(surface) for surface in drawn.values()]
+    links = list(map(index, drawn.values()))
     places = np.array([index(Surface(item.vertices, item.faces)) for item in scene.objects])
     shape_mesh = np.column_stack([np.tile(links, (scene.num_envs, 1)), places[scene.world_object]])
     shape_scale = np.ones(shape_mesh.shape)

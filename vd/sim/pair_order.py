@@ -1,9 +1,9 @@
 """Candidate pairs of shapes, sorted by kind between the solver's broad and narrow phase.
 
 The broad phase lists pairs as it finds them, world by world, and the narrow phase has a kernel for
-each
-combination of kinds, which passes over all of them: of the threads of a warp few have a pair of its
-kind, and the others wait. Sorted, nearly all of a warp have one, or none. Contacts are the same.
+each combination of kinds, which passes over all of them: of the threads of a warp few have a pair
+of its kind, and the others wait. Sorted, nearly all of a warp have one, or none. Contacts are the
+same.
 """
 
 from typing import Any

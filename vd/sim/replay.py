@@ -58,7 +58,7 @@ def simulate_hand(
     answers = []
     for k, trajectory in enumerate(recording.trajectories):
         answers.append(positions[:, k, : len(trajectory.time)])
-    columns = [hand.joint_names.index(name) for name in recording.joints]
+    columns = list(map(hand.joint_names.index, recording.joints))
     return np.concatenate(answers, axis=1)[..., columns]
 
 

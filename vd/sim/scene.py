@@ -354,7 +354,7 @@ def build_scene(
         world_object=world_object,
         world_scale=world_scale,
         bodies_per_world=bodies,
-        link_body=np.array([names.index(link) for link in hand.link_names], dtype=np.int32),
+        link_body=np.array(list(map(names.index, hand.link_names)), dtype=np.int32),
         object_body=object_body,
         shape_kind=shape_kinds(model, bodies, object_body),
         worlds=worlds,

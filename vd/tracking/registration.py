@@ -139,7 +139,8 @@ class Registration:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         samples = np.stack([item.surface_points for item in objects])
-        self._shapes = shapes = Shapes()
+        self.shapes = shapes = Shapes()
+        """Samples and distances of each object's surface, on the device."""
         shapes.samples = array(samples, wp.vec3)
         shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
         shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
@@ -303,7 +304,7 @@ class Registration:
         launch(
             fit_poses_kernel,
             pose.shape,
-            [self._shapes, self._eye, *sizes, envs, *inputs, self._nearness],
+            [self.shapes, self._eye, *sizes, envs, *inputs, self._nearness],
             [pose, cost],
         )
 

@@ -59,7 +59,7 @@ _found: dict[bytes, np.ndarray] = {}
 
 def symmetries(objects: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
     """Symmetries of shapes, the identity first: quaternions [S, 4] for each."""
-    keys = [_key(item) for item in objects]
+    keys = list(map(_key, objects))
     unknown = {}
     for key, item in zip(keys, objects, strict=True):
         if len(item.symmetry) > 1:

@@ -1,9 +1,8 @@
 """How a goal's cloud has to be turned to lie on what a camera sees of an object, learned.
 
 A transformer reads patches of both clouds together, and predicts by how much the goal is still to
-be turned.
-From far off that is ambiguous, from near it is not: so many starts are improved by several passes,
-and laid onto what is seen (:mod:`.icp`). What fits best is believed, and followed.
+be turned. From far off that is ambiguous, from near it is not: so many starts are improved by
+several passes, and laid onto what is seen (:mod:`.icp`). What fits best is believed, and followed.
 
 B clouds, P points of a cloud, T tokens, E the width; N objects, H hypotheses. Clouds are in metres,
 in axes that goal and object share (the world's); a rotation turns the goal onto the object: seen ~

@@ -11,8 +11,8 @@ from torch import Tensor
 from vd.vision.rotations import matrices_about
 
 NEIGHBOURS = 12
-"""Points of which a goal's normals are taken: of 500 they reach about 1.5 cm.
-On validation 8 do the same, on scans 24."""
+"""Points of which a goal's normals are taken: of 500 they reach about 1.5 cm. On validation 8 do
+the same, on scans 24."""
 NEAREST = 0.9
 """Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal
 lacks. On scans 0.8 does the same."""

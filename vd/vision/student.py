@@ -220,7 +220,7 @@ class Student(nn.Module):
         place = believed.position[:, None]
         laid = carried(sight.goal, believed.rotation)
         kinds = [sight.camera - place, sight.hand - place, laid]
-        within = [self._within_reach(kind) for kind in kinds]
+        within = list(map(self._within_reach, kinds))
         voxels = voxelise(within, self.cfg.voxel_m)
         levels = self._convolve(voxels)
         pooled = global_pool(levels[-1]).to(place.dtype)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.objects.contact_layer import CONTACT
+from vd.assets_usd.objects.contact_layer import CONTACT, contact_of
 from vd.assets_usd.objects.sets import load_set
 from vd.command.files import write_json, write_text
 from vd.gap.bench.cases import run_cases
@@ -66,7 +66,7 @@ class ContactCase:
             if name in OUTSIDE:
                 outside[name] = size
                 continue
-            nominal = CONTACT[name].of(item)
+            nominal = contact_of(item, name)
             direction = rng.normal(size=3)
             vector = size * direction / np.linalg.norm(direction)
             values[name] = nominal[0] + size if len(nominal) == 1 else tuple(vector.tolist())

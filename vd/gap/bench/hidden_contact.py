@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.contact_layer import CONTACT, damping_ratio
+from vd.assets_usd.objects.contact_layer import CONTACT, contact_of, damping_ratio
 from vd.assets_usd.objects.model import ObjectModel
 from vd.command.files import write_json
 from vd.gap.bench.hidden_finger import GRAVITY_M_S2
@@ -71,7 +71,7 @@ class ContactPlant:
 
     def value(self, name: str) -> Any:
         """A parameter, a number or three of them."""
-        nominal = CONTACT[name].of(self.item).tolist()
+        nominal = contact_of(self.item, name).tolist()
         value = self.values.get(name, nominal if len(nominal) > 1 else nominal[0])
         return value + 1.0 / RIGID_N_M if name == "tip_compliance" else value
 
