@@ -19,6 +19,7 @@ import pytest
 import trimesh
 import warp as wp
 from scipy.spatial.transform import Rotation
+from small_scenes import SmallScene
 
 from vd.assets_usd import cli
 from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, Workspace, compose
@@ -32,6 +33,8 @@ from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.bundle import read_policy
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import build_hand, new_builder
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
@@ -413,6 +416,29 @@ def test_a_tendons_servo_is_as_stiff_and_strong_as_it_turns_its_joints(
     assert hand.kp[0] == pytest.approx((still - torque(0.01, 0.0)) / 0.01, rel=1e-4)
     assert hand.kd[0] == pytest.approx((still - torque(0.0, 0.01)) / 0.01, rel=1e-4)
     assert hand.effort[0] == pytest.approx(abs(torque(100.0, 0.0)), rel=1e-4)
+
+
+@pytest.mark.parametrize("load", [0.0, -0.2, -0.5, -0.7])
+def test_a_simulated_drive_carries_what_is_on_its_follower(tmp_path, load):
+    """By virtual work: a torque on b4 is 0.8 of it on b3, whose drive has 2 N m/rad and 0.5 N m."""
+    (tmp_path / "said.yaml").write_text("drive: {kp: 2.0, kd: 0.1, effort: 0.5}")
+    hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
+    world = build_hand(hand, SimCfg(), visuals=False)
+    world.gravity = (0.0, 0.0, 0.0)
+    builder = new_builder()
+    builder.add_world(world)
+    scene = SmallScene(builder, SimCfg(), "cpu")
+    target = hand.start + np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
+    scene.control.joint_target_q.assign(target.astype(np.float32))
+    scene.control.joint_f.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, load], dtype=np.float32))
+    scene.run(3.0)
+    q = scene.state.joint_q.numpy()
+    give = abs(load) / (10 * 2.0)  # the solver's coupling is ten times as stiff as the drive, or more
+    np.testing.assert_allclose(q[5], 0.8 * q[4] + 0.05, atol=give + 1e-5)
+    if 0.8 * abs(load) < 0.5:
+        assert q[4] - target[4] == pytest.approx(0.8 * load / 2.0, abs=1e-3)
+    else:
+        assert q[4] < hand.lower[4] + 0.01, "stronger than the drive"
 
 
 def test_a_guessed_drive_has_the_damping_that_its_joint_needs(tmp_path):
