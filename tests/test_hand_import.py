@@ -30,11 +30,11 @@ from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
-from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.bundle import read_policy
 from vd.sim.cfg import SimCfg
-from vd.sim.scene import build_hand, new_builder
+from vd.sim.scene import SHAPE_OBJECT, build_hand, new_builder
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
@@ -726,7 +726,7 @@ def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
         ReorientEnv(replace(cfg, table=TableCfg(away_share=0.5)), "cpu")
 
 
-def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
+def test_a_hand_of_five_motors_trains_with_objects_of_all_its_sizes(tmp_path):
     (tmp_path / "said.yaml").write_text("workspace: {size: [0.04, 0.05]}")
     hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
     small = [
@@ -739,7 +739,7 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
         "--device",
         "cpu",
     ]
-    flags = ["--preset", "leap-objects", "--objects", "cube", "--hand", str(hand.path), *small]
+    flags = ["--preset", "leap-cube", "--hand", str(hand.path), *small]
     assert train(["teacher", *flags, "--out", str(tmp_path / "run")]) == 0
     rows = [
         json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()
@@ -748,7 +748,12 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
     policy = read_policy(tmp_path / "run" / "policy.safetensors")
     assert policy.num_actions == 5
     env = ReorientEnv(ReorientCfg.of(policy), "cpu")
-    assert env.objects[0].longest_side == pytest.approx(0.05)
-    np.testing.assert_allclose(np.ptp(env.objects[0].hulls[0].vertices, axis=0), 0.05, rtol=1e-6)
+    model = env.scene.model
+    cubes = np.flatnonzero(env.scene.shape_kind == SHAPE_OBJECT)
+    sides = [np.ptp(model.shape_source[i].vertices, axis=0) for i in cubes]
+    np.testing.assert_allclose(np.unique(np.round(sides, 5)), np.linspace(0.04, 0.05, 5))
+    plain = ReorientEnv(ReorientCfg.of(policy, randomisation=RandomisationCfg(enabled=False)), "cpu")
+    assert plain.objects[0].longest_side == pytest.approx(0.05), "as little as fits"
+    assert (plain.scene.world_scale == 1.0).all()
     env.step(wp.from_torch(policy.act(wp.to_torch(env.observation))))
     assert np.isfinite(env.observation.numpy()).all()
