@@ -25,6 +25,7 @@ from vd.assets_usd import cli
 from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, Workspace, compose
 from vd.assets_usd.hand_import import bowl
 from vd.assets_usd.hand_import.bowl import NEAR, Drops
+from vd.assets_usd.hand_import.description import read_description
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
@@ -433,7 +434,9 @@ def test_a_simulated_drive_carries_what_is_on_its_follower(tmp_path, load):
     scene.control.joint_f.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, load], dtype=np.float32))
     scene.run(3.0)
     q = scene.state.joint_q.numpy()
-    give = abs(load) / (10 * 2.0)  # the solver's coupling is ten times as stiff as the drive, or more
+    give = abs(load) / (
+        10 * 2.0
+    )  # the solver's coupling is ten times as stiff as the drive, or more
     np.testing.assert_allclose(q[5], 0.8 * q[4] + 0.05, atol=give + 1e-5)
     if 0.8 * abs(load) < 0.5:
         assert q[4] - target[4] == pytest.approx(0.8 * load / 2.0, abs=1e-3)
@@ -680,6 +683,17 @@ def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_
         assert not done.warnings
 
 
+def test_the_left_leap_hand_is_described_as_the_mirror_image_of_the_right_one():
+    right = read_description("leap")
+    left = read_description("leap_left")
+    assert left.motors == right.motors and left.drive == right.drive
+    assert {name: abs(angle) for name, angle in left.start.items()} == right.start
+    assert {name for name, angle in left.start.items() if angle < 0.0} == {"12", "13"}
+    for field in ("drop", "goal"):
+        place = getattr(right.workspace, field)
+        assert getattr(left.workspace, field) == (place[0], -place[1], place[2])
+
+
 @pytest.mark.parametrize("colliders", [1, 6])
 def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
     """Of many colliders, as LEAP has, MuJoCo's masks hold who meets whom by the groups of fingers alone."""
@@ -752,7 +766,9 @@ def test_a_hand_of_five_motors_trains_with_objects_of_all_its_sizes(tmp_path):
     cubes = np.flatnonzero(env.scene.shape_kind == SHAPE_OBJECT)
     sides = [np.ptp(model.shape_source[i].vertices, axis=0) for i in cubes]
     np.testing.assert_allclose(np.unique(np.round(sides, 5)), np.linspace(0.04, 0.05, 5))
-    plain = ReorientEnv(ReorientCfg.of(policy, randomisation=RandomisationCfg(enabled=False)), "cpu")
+    plain = ReorientEnv(
+        ReorientCfg.of(policy, randomisation=RandomisationCfg(enabled=False)), "cpu"
+    )
     assert plain.objects[0].longest_side == pytest.approx(0.05), "as little as fits"
     assert (plain.scene.world_scale == 1.0).all()
     env.step(wp.from_torch(policy.act(wp.to_torch(env.observation))))
