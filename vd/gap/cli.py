@@ -15,6 +15,7 @@ from vd.command.line import parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.gap.contact_cli import Contact, HideContact
 from vd.gap.convert import Convert
+from vd.gap.export import Export
 
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
@@ -178,6 +179,7 @@ Command = (
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
     | Annotated[HideCommand, tyro.conf.subcommand("hide")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Contact, tyro.conf.subcommand("contact")]
     | Annotated[HideContact, tyro.conf.subcommand("hide-contact")]
 )
@@ -186,7 +188,7 @@ Command = (
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: _Step | HideCommand | Convert | Contact | HideContact = parse(
+    command: _Step | HideCommand | Convert | Export | Contact | HideContact = parse(
         Command, arguments, prog="vd-gap", description=__doc__
     )
     from vd.logs.recording import RecordingError

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain, others_in
-from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
+from vd.gap.coordinates import Coordinate, Scales, coordinate, keys_of
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import OWN_ERROR, half_width, rmse, speed_of
 from vd.logs.recording import Recording
@@ -220,7 +220,7 @@ class JointProblem:
         others = others_in(self.rollouts.chain, self.joint)
         slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
         absent = {f"joint_coupling.from_{slot + 1}" for slot in slots}
-        return [key for key in keys(effects, self.baseline) if key not in absent]
+        return [*self.baseline, *(key for key in keys_of(effects) if key not in absent)]
 
     def fit(
         self,

@@ -19,7 +19,6 @@ import numpy as np
 
 from vd.command.config import from_dict, to_dict
 from vd.command.files import atomic_path, write_json
-from vd.kernels.servo.effects import EFFECTS, Parameter
 from vd.logs.motions import Recording
 
 FORMAT = "vd-gap-report/1"
@@ -372,11 +371,6 @@ class Predictions:
             ) from error
         names = {key: tuple(arrays[key].tolist()) for key in ("joints", "files")}
         return Predictions(**{**arrays, **names})
-
-
-def parameters_of(effect: str) -> dict[str, Parameter]:
-    """Parameters of an effect by name."""
-    return {parameter.name: parameter for parameter in EFFECTS[effect].parameters}
 
 
 def effect_values(

@@ -19,7 +19,7 @@ from vd.command.files import write_json
 from vd.gap import rules
 from vd.gap.assemble import AnalysedJoint, assemble, curves
 from vd.gap.chain import Chain, chains, others_in, relative_torques
-from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
+from vd.gap.coordinates import FREE_SPEED, PARAMETERS, Scales
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, JointProblem, JointSpec, Problems
@@ -228,7 +228,7 @@ class _JointAnalysis:
         """The plain model beside joints of which more is known than theirs, and the sizes of its motion."""
         row = base[self.spec.joint].copy()
         for key, value in values.items():
-            row[BASELINE_PARAMETERS[key].column] = value
+            row[PARAMETERS[key].column] = value
         (scales,) = self.ask([partial(JointProblem.scales, row=row, residual=self.spec.floor)])
         call = partial(JointProblem.fit, base=base, effects=(), starts=[values], scales=scales)
         (fit,) = self.ask([call])
@@ -260,7 +260,7 @@ STAGES = 12
 
 def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
     """Values of a baseline's parameters in a row [PARAMETER_COLUMNS], by key."""
-    return {key: float(row[BASELINE_PARAMETERS[key].column]) for key in keys}
+    return {key: float(row[PARAMETERS[key].column]) for key in keys}
 
 
 def _workers(problems: Problems, options: Options) -> WorkerPool:
