@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain, others_in
-from vd.gap.coordinates import Coordinate, Scales, coordinate, keys_of
+from vd.gap.coordinates import FREE_SPEED, PARAMETERS, Coordinate, Scales, coordinate, keys_of
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import OWN_ERROR, half_width, rmse, speed_of
 from vd.logs.recording import Recording
@@ -221,6 +221,24 @@ class JointProblem:
         slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
         absent = {f"joint_coupling.from_{slot + 1}" for slot in slots}
         return [*self.baseline, *(key for key in keys_of(effects) if key not in absent)]
+
+    def plain(
+        self, base: np.ndarray, start: Mapping[str, float] | None = None
+    ) -> tuple[JointFit, Scales]:
+        """The plain model, and the sizes of the joint's motion with it.
+
+        Args:
+            base: Rows of the chain's joints [n, PARAMETER_COLUMNS].
+            start: Starting values by key; ``base`` and some speed limits without.
+        """
+        row = base[self.joint].copy()
+        for key, value in (start or {}).items():
+            row[PARAMETERS[key].column] = value
+        scales = self.scales(row, self.floor)
+        # One speed limit as it is, one that binds, one that does not.
+        limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
+        fit = self.fit(base, (), [{}, *limits] if start is None else [start], scales)
+        return fit, self.scales(fit.rows[self.joint], fit.rmse)
 
     def fit(
         self,

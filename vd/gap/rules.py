@@ -16,11 +16,13 @@ simulate nothing.
    So an effect is named only if without it every model is worse by that interval.
 """
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.stats import binom
 
 import vd.kernels.servo.actuators as servo
@@ -613,26 +615,12 @@ def families_of(
 
 def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
     """Effects that stand in for each other in the good models, a set each."""
-    common = set.intersection(*[{*fit.effects} for fit in good])
-    loose = []
-    for fit in good:
-        loose += [name for name in fit.effects if name not in common and name not in loose]
-    sets: list[tuple[str, ...]] = []
-    for name in loose:
-        merged: tuple[str, ...] = ()
-        others = []
-        for group in sets:
-            if any(apart(name, other, good) for other in group):
-                merged += group
-            else:
-                others.append(group)
-        sets = [*others, (*merged, name)]
-    return sets
-
-
-def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
-    """Whether no good model has both effects."""
-    return not any({name, other} <= {*fit.effects} for fit in good)
+    names = list(dict.fromkeys(itertools.chain.from_iterable(fit.effects for fit in good)))
+    having = np.array([[name in fit.effects for name in names] for fit in good])
+    loose = np.flatnonzero(~having.all(axis=0))
+    together = having[:, loose].T @ having[:, loose]
+    count, labels = connected_components(~together)
+    return [tuple(names[i] for i in loose[labels == group]) for group in range(count)]
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:
