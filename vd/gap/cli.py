@@ -15,7 +15,6 @@ from vd.command.line import parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.gap.contact_cli import Contact, HideContact
 from vd.gap.convert import Convert
-from vd.gap.export import Export
 
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
@@ -167,6 +166,30 @@ class HideCommand:
         hiding = Hiding(self.model, effects, self.seed, excitations=self.excitations, pwm=self.pwm)
         count = len(hide(hiding, self.out).recording.trajectories)
         print(f"{self.out}: {count} motions\n{truth_path(self.out)}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an identified model as MJCF and as actuators of mjlab and Isaac Lab.
+
+    With the layer of a bare servo and --hand, the servo is put into every joint of the hand instead.
+    """
+
+    layer: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAYER")]
+    """The identified.usda that vd-gap run wrote."""
+    out: Path
+    """Folder to write to."""
+    hand: str | None = None
+    """The hand into which a bare servo is to go, or USD file of the hand that the layer is over."""
+    step: float = 0.005
+    """Physics step of mjlab or Isaac Lab, of which their delays are multiples [s]."""
+
+    def run(self) -> int:
+        """Write the files."""
+        from vd.gap.export import export
+
+        export(self.layer, self.out, self.hand, self.step)
         return 0
 
 

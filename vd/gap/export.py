@@ -5,14 +5,11 @@ every actuator), Isaac Lab that of 2.3 or later (friction in N m).
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from pprint import pformat
-from typing import Annotated
 
 import mujoco
 import numpy as np
-import tyro
 
 from vd.assets_usd.hand_layer import open_layer, read_bare_layer, write_layer
 from vd.assets_usd.hands import load_hand
@@ -60,49 +57,32 @@ RIG = ("gravity_load", "payload_inertia", "encoder_bias")
 """Effects of what a bare servo carried, or of how it was mounted."""
 
 
-@dataclass(frozen=True)
-class Export:
-    """Write an identified model as MJCF and as actuators of mjlab and Isaac Lab.
+def export(layer: Path, out: Path, hand: str | None, step: float) -> None:
+    """Write the files to a folder, and say what each of them lacks; fields of ``vd-gap export``."""
+    root = open_layer(layer).defaultPrim
+    bare = root in BARE_MODELS
+    joints = read_joints(layer, None if bare else hand or root)
+    make_folder(out)
+    if bare and hand is not None:
+        path = out / "identified-in-hand.usda"
+        into_hand(layer, joints, hand, path)
+        print(path)
+        return
+    _write(out / "identified.xml", "<!-- {} -->\n", mjcf(joints), joints)
+    for lab in LABS:
+        _write(out / f"identified_{lab}.py", "# {}\n", actuators(lab, joints, step), joints)
 
-    With the layer of a bare servo and --hand, the servo is put into every joint of the hand instead.
-    """
 
-    layer: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAYER")]
-    """The identified.usda that vd-gap run wrote."""
-    out: Path
-    """Folder to write to."""
-    hand: str | None = None
-    """The hand into which a bare servo is to go, or USD file of the hand that the layer is over."""
-    step: float = 0.005
-    """Physics step of mjlab or Isaac Lab, of which their delays are multiples [s]."""
-
-    def run(self) -> int:
-        """Write the files, and say what each of them lacks."""
-        root = open_layer(self.layer).defaultPrim
-        bare = root in BARE_MODELS
-        joints = read_joints(self.layer, None if bare else self.hand or root)
-        make_folder(self.out)
-        if bare and self.hand is not None:
-            path = self.out / "identified-in-hand.usda"
-            into_hand(self.layer, joints, self.hand, path)
-            print(path)
-            return 0
-        self.write("identified.xml", "<!-- {} -->\n", mjcf(joints), joints)
-        for lab in LABS:
-            text = actuators(lab, joints, self.step)
-            self.write(f"identified_{lab}.py", "# {}\n", text, joints)
-        return 0
-
-    def write(self, file: str, comment: str, text: str, joints: "list[JointModel]") -> None:
-        """Write a file with what it lacks at its head, and say that."""
-        lost = []
-        for joint in joints:
-            left = sorted(joint.numbers.keys() - joint.taken)
-            lost += [f"{joint.name} lacks {key} = {joint.numbers[key][0]:.4g}" for key in left]
-            joint.taken.clear()
-        head = "".join(map(comment.format, ["Identified by vd-gap.", *lost]))
-        write_text(self.out / file, head + text)
-        print(self.out / file, *lost, sep="\n  ")
+def _write(path: Path, comment: str, text: str, joints: "list[JointModel]") -> None:
+    """Write a file with what it lacks at its head, and say that."""
+    lost = []
+    for joint in joints:
+        left = sorted(joint.numbers.keys() - joint.taken)
+        lost += [f"{joint.name} lacks {key} = {joint.numbers[key][0]:.4g}" for key in left]
+        joint.taken.clear()
+    head = "".join(map(comment.format, ["Identified by vd-gap.", *lost]))
+    write_text(path, head + text)
+    print(path, *lost, sep="\n  ")
 
 
 class JointModel:

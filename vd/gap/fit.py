@@ -117,36 +117,49 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class JointSpec:
+    """What makes the problem of one joint.
+
+    Attributes:
+        chain: Index of the chain.
+        joint: Index of the joint in the chain.
+        trajectories: Indices of the trajectories used, ascending.
+        folds: Fold of each; a fold is held out as a whole.
+        floor: Noise floor [rad].
+        baseline: Keys of the fitted baseline parameters.
+        pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
+        aside: Index of the trajectory that no fit sees; None where there are too few.
+    """
+
+    chain: int
+    joint: int
+    trajectories: tuple[int, ...]
+    folds: tuple[int, ...]
+    floor: float
+    baseline: tuple[str, ...]
+    pieces: tuple[tuple[int, int], ...] = ()
+    aside: int | None = None
+
+
 class JointProblem:
     """The data of one joint, and fits of models to it.
 
     Args:
         rollouts: Simulation of the joint's chain.
-        joint: Index of the joint in the chain.
-        trajectories: Indices of the trajectories used, ascending.
-        folds: Fold of each of them, shape [S]; a fold is held out as a whole.
-        floor: Noise floor [rad].
-        baseline: Keys of the baseline's parameters.
+        spec: What makes the problem.
     """
 
-    def __init__(
-        self,
-        rollouts: Rollouts,
-        joint: int,
-        trajectories: Sequence[int],
-        folds: Sequence[int],
-        floor: float,
-        baseline: Sequence[str],
-    ):
+    def __init__(self, rollouts: Rollouts, spec: JointSpec):
         self.rollouts = rollouts
         self.slopes = rollouts  # simulates for Jacobians, which need no finer step
-        self.joint = joint
-        self.trajectories = np.asarray(trajectories)
-        self.folds = np.asarray(folds)
-        self.floor = floor
-        self.baseline = tuple(baseline)
+        self.joint = spec.joint
+        self.trajectories = spec.trajectories
+        self.folds = np.array(spec.folds)
+        self.floor = spec.floor
+        self.baseline = spec.baseline
         of_trajectory = rollouts.sample_trajectory
-        parts = [rollouts.measured[of_trajectory == t, joint] for t in self.trajectories]
+        parts = [rollouts.measured[of_trajectory == t, spec.joint] for t in spec.trajectories]
         self._measured = np.concatenate(parts)
         self.count = np.array([len(part) for part in parts])
 
@@ -447,31 +460,6 @@ class _Descent:
         return self.descend(x, iterations, widen=WIDEN)
 
 
-@dataclass(frozen=True, eq=False)
-class JointSpec:
-    """What makes the problem of one joint.
-
-    Attributes:
-        chain: Index of the chain.
-        joint: Index of the joint in the chain.
-        trajectories: Indices of the trajectories used.
-        folds: Fold of each.
-        floor: Noise floor [rad].
-        baseline: Keys of the fitted baseline parameters.
-        pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
-        aside: Index of the trajectory that no fit sees; None where there are too few.
-    """
-
-    chain: int
-    joint: int
-    trajectories: tuple[int, ...]
-    folds: tuple[int, ...]
-    floor: float
-    baseline: tuple[str, ...]
-    pieces: tuple[tuple[int, int], ...] = ()
-    aside: int | None = None
-
-
 class Problems:
     """The problems of a recording, made when they are first asked for.
 
@@ -501,12 +489,5 @@ class Problems:
                 recording = self.recording.cut(parts)
                 chain = self.chains[spec.chain]
                 self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
-            self._problems[key] = JointProblem(
-                self._rollouts[shared],
-                spec.joint,
-                spec.trajectories,
-                spec.folds,
-                spec.floor,
-                spec.baseline,
-            )
+            self._problems[key] = JointProblem(self._rollouts[shared], spec)
         return self._problems[key]
