@@ -3,8 +3,9 @@
 All members of all families make thousands of models. The ladder fits those that can matter, in
 rounds about the best model so far, the plain one at first. A round changes one family at a time: it
 leaves the family out, or puts another member in. A linear estimate screens the changes, those that
-promise least are not fitted. Once the best stays, its families' members are combined; rounds go on
-about models that are not worse. Which model is good is not decided here (:mod:`vd.gap.rules`).
+promise least are not fitted. Rounds go on about models that are not worse; at last other members of
+their families are put into all of these, since what is not fitted is not excluded. Which model is
+good is not decided here (:mod:`vd.gap.rules`).
 
 The members are those of the literature on servos: dry friction as in the models M1 to M4 of BAM
 (Coulomb, Stribeck, either with a part in proportion to the load) or with a direction; a late or a
@@ -12,7 +13,6 @@ smoothed command; a torque that is limited, falls with speed, saturates or follo
 or an ignored error; a soft transmission; a load or an offset.
 """
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +23,7 @@ import numpy as np
 from vd.gap import rules
 from vd.gap.coordinates import PARAMETERS, Scales, keys_of, sizes, torque_power
 from vd.gap.fit import JointFit, JointProblem
-from vd.gap.rules import FAMILIES, Evidence, Family
+from vd.gap.rules import Evidence
 from vd.kernels.servo.effects import EFFECTS
 
 ROUNDS = 5
@@ -32,13 +32,9 @@ FITTED = 9
 """Changes of a round that are fitted, of about 25; of the families that a model has all. Not tuned."""
 STARTS = 2
 """Sizes of a further effect from which a fit starts, the most promising ones. Not tuned."""
-ALIVE = 3
-"""Members of a family that are combined with those of another. Not tuned."""
 COMPLETED = 8
 """Good models in which other members are tried at most: what is not fitted is not excluded. More than
 eight were good on two of 14 halves of recordings. Not tuned."""
-COMBINED = 8
-"""Combinations at a time at most. Not tuned."""
 
 FitCall = Callable[[JointProblem], Any]
 RunCalls = Callable[[Sequence[FitCall]], list[Any]]
@@ -77,8 +73,6 @@ class Ladder:
             self.fit_changes(centre, FITTED)
             self.prune()
             done.append(centre)
-            if self.good()[0] is centre:
-                self.combine(centre)
         completed: list[JointFit] = []
         while len(completed) < COMPLETED:
             centre = next((fit for fit in self.good() if fit not in completed), None)
@@ -215,28 +209,6 @@ class Ladder:
             known = self.models.get(effects)
             if known is None or fit.rmse < known.rmse:
                 self.models[effects] = fit
-
-    def combine(self, best: JointFit) -> None:
-        """Fit a model with other members of two of its families, of the members that do best alone."""
-        families = [family for family in FAMILIES.values() if family.effects & {*best.effects}]
-        calls: dict[Effects, FitCall] = {}
-        for one, other in itertools.combinations(families, 2):
-            rest = {*best.effects} - one.effects - other.effects
-            for first, second in itertools.product(self.alive(best, one), self.alive(best, other)):
-                members = {*first.effects} & one.effects | {*second.effects} & other.effects
-                effects = frozenset(rest | members)
-                if effects not in self.models and len(calls) < COMBINED:
-                    values = {**best.values, **first.values, **second.values}
-                    calls[effects] = self.call(effects, [within(values, effects)])
-        self.fit(calls)
-
-    def alive(self, best: JointFit, family: Family) -> list[JointFit]:
-        """The models that have another member of a family than the best, and it, the best first."""
-        rest = frozenset(best.effects) - family.effects
-        members = [frozenset(member) | rest for member in family.members]
-        fits = [self.models[effects] for effects in members if effects in self.models]
-        order = np.argsort(rules.scores(self.evidence, fits))
-        return [fits[index] for index in order[:ALIVE]]
 
 
 def within(values: Mapping[str, float], effects: Iterable[str]) -> dict[str, float]:
