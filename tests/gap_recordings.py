@@ -9,7 +9,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate
 from vd.gap.design import design
-from vd.gap.fit import JointFit, JointProblem
+from vd.gap.fit import JointFit, JointProblem, JointSpec
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.workflow import baseline_of
@@ -76,10 +76,8 @@ def problem_of(recording: Recording) -> JointProblem:
     """What is to be fitted on the only joint of a recording."""
     (chain,) = chains(recording)
     trajectories, folds, _ = design(recording, chain, 0)
-    floor = noise_floor(recording, 0)
-    return JointProblem(
-        Rollouts(chain, recording), 0, trajectories, folds, floor, baseline_of(chain)
-    )
+    spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
+    return JointProblem(Rollouts(chain, recording), spec)
 
 
 def made_up(

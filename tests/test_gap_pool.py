@@ -50,6 +50,7 @@ def test_processes_find_what_one_alone_finds() -> None:
     problems, spec = problem({servo.COULOMB_TORQUE: 0.06})
     with WorkerPool(problems.of, workers=1) as pool:
         alone = fits(pool, problems, spec)
+    problems, spec = problem({servo.COULOMB_TORQUE: 0.06})
     with WorkerPool(problems.of, workers=2) as pool:
         for one, other in zip(alone, fits(pool, problems, spec), strict=True):
             np.testing.assert_array_equal(one.x, other.x)

@@ -21,7 +21,6 @@ from vd.gap.result import (
     Misfit,
     Predictions,
     Report,
-    effect_values,
 )
 from vd.kernels.servo.effects import EFFECTS
 
@@ -110,13 +109,6 @@ def test_curves_come_back(curves, tmp_path):
     path.write_text("t")
     with pytest.raises(ValueError, match="not curves"):
         Predictions.read(path)
-
-
-def test_effects_reach_the_layer_joint_by_joint(report):
-    assert effect_values(report.effects, JOINT) == {
-        "coulomb_friction": {"tau_c_nm": (FRICTION, 0.14, 0.16)}
-    }
-    assert effect_values(report.effects, "another") == {}
 
 
 def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):

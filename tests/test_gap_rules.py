@@ -85,8 +85,29 @@ def test_what_few_motions_show_is_delivered_and_not_named(evidence: Evidence) ->
     both = made_up(("load_friction", "torque_saturation"), 0.004)
     conclusion = conclude(evidence, PLAIN, [PLAIN, alone, both], "")
     assert conclusion.final is both and conclusion.names == ("load_friction",)
-    assert conclusion.families["torque ceiling"] == "likely"
+    assert conclusion.families["torque ceiling"] == "untold"
     assert open_sets(conclusion.good) == [("torque_saturation",)]
+
+
+def test_a_family_is_likely_if_more_motions_speak_for_it_than_luck_has(evidence: Evidence) -> None:
+    """Nine of ten motions are, six are not; a tenth keeps the other model among the good ones."""
+    friction = made_up(("coulomb_friction",), np.array([0.005] * 9 + [0.004]))
+    for won, verdict in ((9, "likely"), (6, "untold")):
+        play = made_up(("backlash",), np.array([0.004] * won + [0.0055] * (9 - won) + [0.008]))
+        conclusion = conclude(evidence, PLAIN, [PLAIN, friction, play], "")
+        assert conclusion.families["play"] == verdict and len(conclusion.good) == 2
+
+
+def test_what_no_use_would_notice_makes_no_model_worse(evidence: Evidence) -> None:
+    """Each motion is 0.5 % worse, without doubt, or 10 % worse."""
+    best = made_up(("dead_zone",), 0.0040)
+    close = made_up(("coulomb_friction",), 0.00402)
+    far = made_up(("load_friction",), 0.0044)
+    assert difference(evidence, best, close)[0] > 0.0
+    assert good_models(evidence, [PLAIN, best, close, far]) == [best, close]
+    conclusion = conclude(evidence, PLAIN, [PLAIN, best, close, far], "")
+    assert {*conclusion.families.values()} == {"untold"}
+    assert conclusion.shares == pytest.approx([0.5, 0.5])
 
 
 def test_intervals_are_wider_over_fewer_blocks_of_motions(evidence: Evidence) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vd.gap import rules
-from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
+from vd.gap.coordinates import GRAVITY, PARAMETERS
 from vd.gap.fit import FINER, JointFit, JointSpec, Problems, intervals
 from vd.gap.result import (
     Alternative,
@@ -26,7 +26,6 @@ from vd.gap.result import (
     Report,
     TrajectoryError,
     WholeModel,
-    parameters_of,
 )
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
@@ -202,7 +201,7 @@ def _baseline_values(spec: JointSpec, fit: JointFit) -> dict[str, float]:
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and row[GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)
-    return {name: float(row[BASELINE_PARAMETERS[name].column]) for name in names}
+    return {name: float(row[PARAMETERS[name].column]) for name in names}
 
 
 def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -263,8 +262,7 @@ def _effect(name: str, joint: AnalysedJoint) -> NamedEffect:
     for key, value in joint.final.values.items():
         effect, _, parameter = key.rpartition(".")
         if effect == name:
-            unit = parameters_of(name)[parameter].unit
-            parameters[parameter] = Estimate(value, spread[key], unit)
+            parameters[parameter] = Estimate(value, spread[key], PARAMETERS[key].unit)
     having = [name in fit.effects for fit in joint.conclusion.good]
     return NamedEffect(
         name=name,

@@ -169,6 +169,30 @@ class HideCommand:
         return 0
 
 
+@dataclass(frozen=True)
+class Export:
+    """Write an identified model as MJCF and as actuators of mjlab and Isaac Lab.
+
+    With the layer of a bare servo and --hand, the servo is put into every joint of the hand instead.
+    """
+
+    layer: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAYER")]
+    """The identified.usda that vd-gap run wrote."""
+    out: Path
+    """Folder to write to."""
+    hand: str | None = None
+    """The hand into which a bare servo is to go, or USD file of the hand that the layer is over."""
+    step: float = 0.005
+    """Physics step of mjlab or Isaac Lab, of which their delays are multiples [s]."""
+
+    def run(self) -> int:
+        """Write the files."""
+        from vd.gap.export import export
+
+        export(self.layer, self.out, self.hand, self.step)
+        return 0
+
+
 Command = (
     Annotated[RunCommand, tyro.conf.subcommand("run")]
     | Annotated[FindCommand, tyro.conf.subcommand("find")]
@@ -178,6 +202,7 @@ Command = (
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
     | Annotated[HideCommand, tyro.conf.subcommand("hide")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Contact, tyro.conf.subcommand("contact")]
     | Annotated[HideContact, tyro.conf.subcommand("hide-contact")]
 )
@@ -186,7 +211,7 @@ Command = (
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: _Step | HideCommand | Convert | Contact | HideContact = parse(
+    command: _Step | HideCommand | Convert | Export | Contact | HideContact = parse(
         Command, arguments, prog="vd-gap", description=__doc__
     )
     from vd.logs.recording import RecordingError

@@ -20,7 +20,6 @@ from vd.gap.result import (
     NamedEffect,
     Predictions,
     Report,
-    effect_values,
 )
 from vd.kernels.servo.effects import BASELINE, EFFECTS
 from vd.logs.recording import Recording
@@ -108,17 +107,18 @@ def _effects(
     """Effects of a joint: those it started with, a pendulum's gravity, and the identified ones."""
     values: dict[str, dict[str, Any]] = {}
     if joint in start:
-        for effect in EFFECTS.values():
-            row = {p.name: float(start[joint][p.column]) for p in effect.parameters}
-            if any(row[p.name] != p.neutral for p in effect.parameters):
-                values[effect.name] = row
+        for named in EFFECTS.values():
+            row = {p.name: float(start[joint][p.column]) for p in named.parameters}
+            if any(row[p.name] != p.neutral for p in named.parameters):
+                values[named.name] = row
     if GRAVITY.name in fitted:
         values.setdefault("gravity_load", {})[GRAVITY.name] = fitted[GRAVITY.name]
-    for name, parameters in effect_values(held, joint).items():
-        known = values.setdefault(name, {})
-        for key, (value, low, high) in parameters.items():
-            certain = np.isfinite([low, high]).all() and low <= value <= high
-            known[key] = (value, low, high) if certain else value
+    for effect in held:
+        for key, one in effect.parameters.items() if joint in effect.joints else ():
+            low, high = one.ci95
+            certain = -np.inf < low <= one.value <= high < np.inf
+            known = (one.value, low, high) if certain else one.value
+            values.setdefault(effect.name, {})[key] = known
     return values
 
 

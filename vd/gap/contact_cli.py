@@ -101,10 +101,11 @@ def contact_report(
     estimates = {}
     parameters = {}
     for each in found:
-        interval = [numbers(each.low), numbers(each.high)]
-        unit = CONTACT[each.name].unit
-        one = {"value": numbers(each.value), "ci95": interval, "unit": unit}
-        estimates[each.name] = one
+        one = estimates[each.name] = {
+            "value": numbers(each.value),
+            "ci95": [numbers(each.low), numbers(each.high)],
+            "unit": CONTACT[each.name].unit,
+        }
         parameters[each.name] = {
             **one,
             "verdict": each.verdict,

@@ -1,7 +1,7 @@
 """Coordinates in which the servo model is fitted, and sizes at which the search for an effect starts."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +10,12 @@ import vd.kernels.servo.actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter
 
 GRAVITY, _ = EFFECTS["gravity_load"].parameters
-BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
-"""Everything that a baseline can fit, by name."""
+PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
+"""Everything that can be fitted, by key: ``kp`` of a baseline, ``effect.parameter`` of effects."""
+for _effect in EFFECTS.values():
+    PARAMETERS |= {
+        f"{_effect.name}.{parameter.name}": parameter for parameter in _effect.parameters
+    }
 
 LOG_STEP = 0.01
 """Finite-difference step of a logarithmic coordinate: above the noise of single precision. Not
@@ -144,13 +148,8 @@ class Scales:
 
 
 def coordinate(key: str, scales: Scales) -> Coordinate:
-    """The coordinate of a parameter by its key (``kp``, ``effect.parameter``)."""
-    effect, _, name = key.rpartition(".")
-    parameter = (
-        next(p for p in EFFECTS[effect].parameters if p.name == name)
-        if effect
-        else BASELINE_PARAMETERS[name]
-    )
+    """The coordinate of a parameter by its key."""
+    parameter = PARAMETERS[key]
     if parameter.lower > 0.0:
         bounds = math.log(parameter.lower), math.log(parameter.upper)
         return Coordinate(key, parameter.column, True, 1.0, *bounds)
@@ -160,18 +159,14 @@ def coordinate(key: str, scales: Scales) -> Coordinate:
 
 
 def torque_power(key: str) -> int:
-    """Power with which an effect's parameter follows the unit of torque: 1, 0, or -1."""
-    effect, _, name = key.rpartition(".")
-    parameters = EFFECTS[effect].parameters if effect else ()
-    for parameter in parameters:
-        if parameter.name == name:
-            return -1 if parameter.unit == "1/(N m)" else int(parameter.of_torque)
-    return 0
+    """Power with which a parameter follows the unit of torque: 1, 0, or -1."""
+    parameter = PARAMETERS[key]
+    return -1 if parameter.unit == "1/(N m)" else int(parameter.of_torque)
 
 
-def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:
-    """Keys of all fitted parameters of a model: the baseline's, then the effects'."""
-    return [*baseline, *(f"{name}.{p.name}" for name in effects for p in EFFECTS[name].parameters)]
+def keys_of(effects: Collection[str]) -> list[str]:
+    """Keys of the parameters of effects, in the order of the table."""
+    return [key for key in PARAMETERS if key.rpartition(".")[0] in effects]
 
 
 def _scale(parameter: Parameter, scales: Scales) -> float:
@@ -212,15 +207,14 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         "sag": 1.0 / scales.peak,
         "rate": 1.0 / scales.duration,
     }
-    columns = {}
-    for parameter in EFFECTS[effect].parameters:
-        key = f"{effect}.{parameter.name}"
+    names = keys_of([effect])
+    columns = []
+    for key in names:
         unit, factors = STARTS[key]
         values = units[unit] * np.array(factors)
-        inside = np.clip(values, parameter.lower, parameter.upper)
-        columns[key] = np.where(values > 0.0, inside, values)
-    count = len(next(iter(columns.values())))
-    starts = [{key: float(values[i]) for key, values in columns.items()} for i in range(count)]
+        inside = np.clip(values, PARAMETERS[key].lower, PARAMETERS[key].upper)
+        columns.append(np.where(values > 0.0, inside, values))
+    starts = [dict(zip(names, row, strict=True)) for row in np.transpose(columns).tolist()]
     if effect in SLOWING:
         # The baseline's speed limit took the effect's place: let go of it as well.
         starts += [{**start, "velocity_limit": FREE_SPEED * scales.speed} for start in starts]

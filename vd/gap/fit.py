@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain, others_in
-from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
+from vd.gap.coordinates import FREE_SPEED, PARAMETERS, Coordinate, Scales, coordinate, keys_of
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import OWN_ERROR, half_width, rmse, speed_of
 from vd.logs.recording import Recording
@@ -117,36 +117,49 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class JointSpec:
+    """What makes the problem of one joint.
+
+    Attributes:
+        chain: Index of the chain.
+        joint: Index of the joint in the chain.
+        trajectories: Indices of the trajectories used, ascending.
+        folds: Fold of each; a fold is held out as a whole.
+        floor: Noise floor [rad].
+        baseline: Keys of the fitted baseline parameters.
+        pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
+        aside: Index of the trajectory that no fit sees; None where there are too few.
+    """
+
+    chain: int
+    joint: int
+    trajectories: tuple[int, ...]
+    folds: tuple[int, ...]
+    floor: float
+    baseline: tuple[str, ...]
+    pieces: tuple[tuple[int, int], ...] = ()
+    aside: int | None = None
+
+
 class JointProblem:
     """The data of one joint, and fits of models to it.
 
     Args:
         rollouts: Simulation of the joint's chain.
-        joint: Index of the joint in the chain.
-        trajectories: Indices of the trajectories used, ascending.
-        folds: Fold of each of them, shape [S]; a fold is held out as a whole.
-        floor: Noise floor [rad].
-        baseline: Keys of the baseline's parameters.
+        spec: What makes the problem.
     """
 
-    def __init__(
-        self,
-        rollouts: Rollouts,
-        joint: int,
-        trajectories: Sequence[int],
-        folds: Sequence[int],
-        floor: float,
-        baseline: Sequence[str],
-    ):
+    def __init__(self, rollouts: Rollouts, spec: JointSpec):
         self.rollouts = rollouts
         self.slopes = rollouts  # simulates for Jacobians, which need no finer step
-        self.joint = joint
-        self.trajectories = np.asarray(trajectories)
-        self.folds = np.asarray(folds)
-        self.floor = floor
-        self.baseline = tuple(baseline)
+        self.joint = spec.joint
+        self.trajectories = spec.trajectories
+        self.folds = np.array(spec.folds)
+        self.floor = spec.floor
+        self.baseline = spec.baseline
         of_trajectory = rollouts.sample_trajectory
-        parts = [rollouts.measured[of_trajectory == t, joint] for t in self.trajectories]
+        parts = [rollouts.measured[of_trajectory == t, spec.joint] for t in spec.trajectories]
         self._measured = np.concatenate(parts)
         self.count = np.array([len(part) for part in parts])
 
@@ -220,7 +233,25 @@ class JointProblem:
         others = others_in(self.rollouts.chain, self.joint)
         slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
         absent = {f"joint_coupling.from_{slot + 1}" for slot in slots}
-        return [key for key in keys(effects, self.baseline) if key not in absent]
+        return [*self.baseline, *(key for key in keys_of(effects) if key not in absent)]
+
+    def plain(
+        self, base: np.ndarray, start: Mapping[str, float] | None = None
+    ) -> tuple[JointFit, Scales]:
+        """The plain model, and the sizes of the joint's motion with it.
+
+        Args:
+            base: Rows of the chain's joints [n, PARAMETER_COLUMNS].
+            start: Starting values by key; ``base`` and some speed limits without.
+        """
+        row = base[self.joint].copy()
+        for key, value in (start or {}).items():
+            row[PARAMETERS[key].column] = value
+        scales = self.scales(row, self.floor)
+        # One speed limit as it is, one that binds, one that does not.
+        limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
+        fit = self.fit(base, (), [{}, *limits] if start is None else [start], scales)
+        return fit, self.scales(fit.rows[self.joint], fit.rmse)
 
     def fit(
         self,
@@ -429,31 +460,6 @@ class _Descent:
         return self.descend(x, iterations, widen=WIDEN)
 
 
-@dataclass(frozen=True, eq=False)
-class JointSpec:
-    """What makes the problem of one joint.
-
-    Attributes:
-        chain: Index of the chain.
-        joint: Index of the joint in the chain.
-        trajectories: Indices of the trajectories used.
-        folds: Fold of each.
-        floor: Noise floor [rad].
-        baseline: Keys of the fitted baseline parameters.
-        pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
-        aside: Index of the trajectory that no fit sees; None where there are too few.
-    """
-
-    chain: int
-    joint: int
-    trajectories: tuple[int, ...]
-    folds: tuple[int, ...]
-    floor: float
-    baseline: tuple[str, ...]
-    pieces: tuple[tuple[int, int], ...] = ()
-    aside: int | None = None
-
-
 class Problems:
     """The problems of a recording, made when they are first asked for.
 
@@ -483,12 +489,5 @@ class Problems:
                 recording = self.recording.cut(parts)
                 chain = self.chains[spec.chain]
                 self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
-            self._problems[key] = JointProblem(
-                self._rollouts[shared],
-                spec.joint,
-                spec.trajectories,
-                spec.folds,
-                spec.floor,
-                spec.baseline,
-            )
+            self._problems[key] = JointProblem(self._rollouts[shared], spec)
         return self._problems[key]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from vd.command.files import atomic_path
 from vd.command.page import FIGURE_DPI, write_html
 from vd.gap import figures, words
-from vd.gap.coordinates import BASELINE_PARAMETERS
+from vd.gap.coordinates import PARAMETERS
 from vd.gap.result import (
     Credit,
     FamilyVerdict,
@@ -19,7 +19,6 @@ from vd.gap.result import (
     Report,
     TrajectoryError,
     WholeModel,
-    parameters_of,
 )
 from vd.gap.words import amount, mrad, percent, plain
 from vd.kernels.servo.effects import EFFECTS
@@ -147,8 +146,7 @@ def _family_row(row: FamilyVerdict) -> Row:
 def _model_row(row: WholeModel) -> Row:
     values = []
     for key, value in row.parameters.items():
-        effect, _, name = key.partition(".")
-        values.append(f"{name} {amount(value, parameters_of(effect)[name].unit)}")
+        values.append(f"{PARAMETERS[key].name} {amount(value, PARAMETERS[key].unit)}")
     return (
         row.joint,
         words.model_text(row.effects),
@@ -186,7 +184,7 @@ def _model(report: Report) -> list[Row]:
     for joint, after in report.identified.parameters.items():
         before = report.baseline.parameters[joint]
         for name, value in after.items():
-            unit = words.unit_text(BASELINE_PARAMETERS[name].unit)
+            unit = words.unit_text(PARAMETERS[name].unit)
             old = f"{before[name]:.3g}" if name in before else ""
             rows.append((joint, f"{name} [{unit}]", old, f"{value:.3g}"))
     return rows

@@ -10,7 +10,7 @@ Angles are radians, errors are of the recorded joint position, intervals are 95 
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,6 @@ import numpy as np
 
 from vd.command.config import from_dict, to_dict
 from vd.command.files import atomic_path, write_json
-from vd.kernels.servo.effects import EFFECTS, Parameter
 from vd.logs.motions import Recording
 
 FORMAT = "vd-gap-report/1"
@@ -31,8 +30,8 @@ _OPTIONAL = ("hand", "hand_layer", "closing", "delivered")
 Verdict = Literal["effects", "ambiguous", "unknown", "under_excited", "no_gap"]
 """That of a recording is the first of these that some joint has."""
 Certainty = Literal["certain", "likely", "untold", "excluded"]
-"""What is known of a family of causes: all good models have it; those that have it predict more than
-half of the motions best; fewer; none has it."""
+"""What is known of a family of causes: all good models have it; those that have it predict more
+motions best than luck gives; no more; none has it."""
 Interval = tuple[float, float]
 
 
@@ -372,23 +371,6 @@ class Predictions:
             ) from error
         names = {key: tuple(arrays[key].tolist()) for key in ("joints", "files")}
         return Predictions(**{**arrays, **names})
-
-
-def parameters_of(effect: str) -> dict[str, Parameter]:
-    """Parameters of an effect by name."""
-    return {parameter.name: parameter for parameter in EFFECTS[effect].parameters}
-
-
-def effect_values(
-    effects: Sequence[NamedEffect], joint: str
-) -> dict[str, dict[str, tuple[float, float, float]]]:
-    """Effect -> parameter -> (value, low, high) of one joint, as the hand's layer stores them."""
-    result = {}
-    for effect in effects:
-        if joint in effect.joints:
-            known = effect.parameters.items()
-            result[effect.name] = {name: (p.value, *p.ci95) for name, p in known}
-    return result
 
 
 def _each_number(value: Any, change: Callable[[float | None], float | None]) -> Any:

@@ -76,7 +76,6 @@ class Rollouts:
         self.recording = recording
         self.dt = dt
         self.device = device
-        self._finer: dict[float, Rollouts] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
         counts = [len(t.time) for t in trajectories]
@@ -88,20 +87,8 @@ class Rollouts:
         self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)
 
     def at(self, dt: float) -> "Rollouts":
-        """The same with another time step [s].
-
-        Kept, so that who asks again simulates with the same.
-        """
-        if dt not in self._finer:
-            self._finer[dt] = Rollouts(self.chain, self.recording, dt=dt, device=self.device)
-        return self._finer[dt]
-
-    def __getstate__(self) -> dict[str, object]:
-        """Leave the device's arrays behind: another process makes its own."""
-        kept = {
-            key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")
-        }
-        return {**kept, "_finer": {}}
+        """The same with another time step [s]."""
+        return Rollouts(self.chain, self.recording, dt=dt, device=self.device)
 
     @cached_property
     def _samples(self) -> Samples:

@@ -9,23 +9,28 @@ simulate nothing.
 2. Whether there is a gap: not where the plain model leaves no more than noise.
 3. The best model: least error of the models that earn what they have more than each smaller one
    that they contain, by one standard error over motions.
-4. Which models are good: those that are not worse than the best by the 95 % interval of paired
-   differences over motions, or by samples where the best leaves no more than noise.
+4. Which models are good: those that are not sure to be worse than the best by more than 5 %, by
+   the 95 % interval of paired differences over motions, or by samples where the best leaves no more
+   than noise.
 5. What is named: what all good models share, if fitted and held-out errors both fall by enough.
    So an effect is named only if without it every model is worse by that interval.
 """
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import binom
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
+from vd.gap.coordinates import PARAMETERS, keys_of
 from vd.gap.fit import JointFit, intervals
 from vd.gap.result import Certainty, Verdict
-from vd.gap.statistics import OWN_ERROR, REPEATABLE, half_width, rmse
+from vd.gap.statistics import CONFIDENCE, OWN_ERROR, REPEATABLE, half_width, rmse
 from vd.gap.telemetry import Telemetry
 from vd.gap.words import listing, model_text, percent
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
@@ -120,8 +125,8 @@ NO_GAP = 1.15
 """A model within this factor of the noise floor leaves white residuals, and nothing to explain.
 Half of what it leaves above 1 turns none of 41 joints, twice turns five."""
 MIN_GAIN = 0.05
-"""Share of the error that an addition to a model must remove. Half turns none of 41 joints, twice
-turns one."""
+"""Share of the error that an addition to a model must remove, and by which a model is worse than
+another. Of an addition, half turns none of 41 joints, twice turns one."""
 PENALTY = 0.01
 """Relative error that a further effect, and each of its parameters, must earn. Half and twice turn
 none of 41 joints."""
@@ -246,12 +251,13 @@ def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[st
     swaps = []
     for family in FAMILIES.values():
         swaps += [(present - family.effects, member) for member in ((), *family.members)]
-    for name, parts in TOGETHER.items():
-        if name in present:
-            swaps.append((present - {name} - FAMILIES["load or offset"].effects, parts))
+    if "asymmetric_friction" in present:  # friction beside a load or an offset can be the same
+        rest = present - FAMILIES["dry friction"].effects - FAMILIES["load or offset"].effects
+        for member in FAMILIES["load or offset"].members:
+            swaps.append((rest | {"coulomb_friction"}, member))
     for rest, member in swaps:
         model = frozenset(rest.union(member))
-        if model != present and {*allowed}.issuperset(member):
+        if model != present and {*allowed}.issuperset(model - present):
             result.append(model)
     return result
 
@@ -340,8 +346,8 @@ def shown(
     """
     limits = []
     strengths = []
-    for parameter in EFFECTS[name].parameters:
-        key = f"{name}.{parameter.name}"
+    for key in keys_of([name]):
+        parameter = PARAMETERS[key]
         if parameter.column == servo.GRAVITY_PHASE or key not in values:
             continue
         low, high = spread[key]
@@ -440,7 +446,7 @@ def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
     even if few motions show it, but not if the best itself leaves as much more than noise.
     """
     if not white(evidence, best):
-        return difference(evidence, best, other)[0] <= 0.0
+        return difference(evidence, best, other)[0] <= MIN_GAIN * best.held_out_rmse
     own = (best.rmse / evidence.floor) ** 2
     excess = (other.rmse / evidence.floor) ** 2 - own
     if excess > 0.0:  # what needs more parameters to do worse is no equal
@@ -476,9 +482,10 @@ def against(
 
 
 def shares(evidence: Evidence, good: Sequence[JointFit]) -> np.ndarray:
-    """Share of the motions that each good model predicts best of them."""
-    winners = np.argmin(errors(evidence, good), axis=0)
-    return np.bincount(winners, minlength=len(good)) / len(winners)
+    """Share of the motions that each good model predicts best of them; those about as good share."""
+    error = np.sqrt(errors(evidence, good))
+    best = error <= error.min(axis=0) / (1.0 - MIN_GAIN)
+    return (best / best.sum(axis=0)).mean(axis=1)
 
 
 # 5. What is named.
@@ -587,8 +594,10 @@ def families_of(
 ) -> dict[str, Certainty]:
     """What good models say of each family: certain if all have it, excluded if none.
 
-    Likely if those that have it predict more than half of the motions best, untold if not.
+    Likely if those that have it predict so many motions best that as many by chance, as of tossed
+    coins, are not to be expected; untold if not.
     """
+    motions = len(good[0].count)
     tried = set().union(*(fit.effects for fit in fits))
     result: dict[str, Certainty] = {}
     for name, family in FAMILIES.items():
@@ -596,7 +605,9 @@ def families_of(
         if having.all():
             result[name] = "certain"
         elif having.any():
-            result[name] = "likely" if weights[having].sum() > 0.5 else "untold"
+            best = round(weights[having].sum() * motions)
+            luck = binom.sf(best - 1, motions, 0.5)
+            result[name] = "likely" if luck < 1.0 - CONFIDENCE else "untold"
         elif tried & family.effects:
             result[name] = "excluded"
     return result
@@ -604,26 +615,12 @@ def families_of(
 
 def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
     """Effects that stand in for each other in the good models, a set each."""
-    common = set.intersection(*[{*fit.effects} for fit in good])
-    loose = []
-    for fit in good:
-        loose += [name for name in fit.effects if name not in common and name not in loose]
-    sets: list[tuple[str, ...]] = []
-    for name in loose:
-        merged: tuple[str, ...] = ()
-        others = []
-        for group in sets:
-            if any(apart(name, other, good) for other in group):
-                merged += group
-            else:
-                others.append(group)
-        sets = [*others, (*merged, name)]
-    return sets
-
-
-def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
-    """Whether no good model has both effects."""
-    return not any({name, other} <= {*fit.effects} for fit in good)
+    names = list(dict.fromkeys(itertools.chain.from_iterable(fit.effects for fit in good)))
+    having = np.array([[name in fit.effects for name in names] for fit in good])
+    loose = np.flatnonzero(~having.all(axis=0))
+    together = having[:, loose].T @ having[:, loose]
+    count, labels = connected_components(~together)
+    return [tuple(names[i] for i in loose[labels == group]) for group in range(count)]
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:

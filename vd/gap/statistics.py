@@ -7,6 +7,7 @@ trajectory, never the sample.
 """
 
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import t as student
 
 from vd.logs.motions import FLICKER_COUNTS, Recording, Trajectory
@@ -76,7 +77,10 @@ def noise_floor(recording: Recording, joint: int) -> float:
     if len(resting) >= MIN_SAMPLES:
         variances.append(float(np.mean(resting)))
     if len(moving) >= MIN_SAMPLES:
-        variances.append(float(np.median(moving)))
+        # Motion disturbs many windows: the lower quartile, as far below the mean as of white noise.
+        freedom = MIN_SAMPLES - 3
+        low = float(chi2.ppf(0.25, freedom)) / freedom
+        variances.append(float(np.quantile(moving, 0.25)) / low)
     return float(np.sqrt(max(variances)))
 
 

@@ -59,9 +59,10 @@ def telemetry_of(
     )
 
 
-def _recorded(values: np.ndarray | None, column: int) -> bool:
-    """Whether a channel is recorded for a joint."""
-    return values is not None and bool(np.isfinite(values[:, column]).all())
+def _recorded(values: np.ndarray | None, column: int) -> np.ndarray | None:
+    """What a channel has of a joint [T], where it is recorded throughout."""
+    own = None if values is None else values[:, column]
+    return own if own is not None and np.isfinite(own).all() else None
 
 
 def _follows(
@@ -76,8 +77,8 @@ def _follows(
     column = chain.columns[joint]
     reference = chain.reference_p_gain
     for t in trajectories:
-        if t.pwm is not None and _recorded(t.pwm, column):
-            duty = t.pwm[:, column]
+        duty = _recorded(t.pwm, column)
+        if duty is not None:
             sent = np.maximum(np.searchsorted(t.sent, t.time - command_delay, side="right") - 1, 0)
             position = np.interp(t.time + read_delay, t.time, t.position[:, column])
             gain = float(t.conditions.get("p_gain", reference)) / reference if reference else 1.0
@@ -94,12 +95,11 @@ def _voltage_fall(trajectories: list[Trajectory], column: int) -> tuple[float, f
     """How far the voltage falls at full pull, and its value idle [V]; None where it is not told."""
     pairs = [np.zeros((2, 0))]
     for t in trajectories:
-        if t.voltage is not None and _recorded(t.voltage, column):
-            pull = t.command - t.position
-            if t.pwm is not None and _recorded(t.pwm, column):
-                pull = t.pwm
-            on = t.enabled[:, column]
-            pairs.append(np.array([np.abs(pull[on, column]), t.voltage[on, column]]))
+        voltage = _recorded(t.voltage, column)
+        if voltage is not None:
+            pull = _recorded(t.pwm, column)
+            pull = (t.command - t.position)[:, column] if pull is None else pull
+            pairs.append(np.array([np.abs(pull), voltage])[:, t.enabled[:, column]])
     pull, volt = np.concatenate(pairs, axis=1)
     if len(volt) < MIN_SAMPLES:
         return None

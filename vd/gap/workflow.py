@@ -19,7 +19,7 @@ from vd.command.files import write_json
 from vd.gap import rules
 from vd.gap.assemble import AnalysedJoint, assemble, curves
 from vd.gap.chain import Chain, chains, others_in, relative_torques
-from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
+from vd.gap.coordinates import PARAMETERS
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, JointProblem, JointSpec, Problems
@@ -197,9 +197,9 @@ class _JointAnalysis:
         for other in others:
             if other.spec.chain == spec.chain:
                 base[other.spec.joint] = other.conclusion.final.rows[other.spec.joint]
-        values = baseline_values(rows[spec.joint], spec.baseline)
         base[spec.joint] = chain.start_row[spec.joint]
-        plain, scales = self.plain(base, values)
+        start = baseline_values(rows[spec.joint], spec.baseline)
+        ((plain, scales),) = self.ask([partial(JointProblem.plain, base=base, start=start)])
         evidence = rules.Evidence(spec.floor, spec.folds, plain.rmse)
         loose = rules.undetermined(evidence, plain)
         allowed, vetoes, means = self.candidates()
@@ -223,18 +223,6 @@ class _JointAnalysis:
             conclusion = replace(conclusion, final=refined)
         self.options.progress(f"explain: {self.name}: {conclusion.verdict}: {conclusion.reason}")
         return AnalysedJoint(self.name, spec, plain, conclusion, evidence, fits, vetoes, means)
-
-    def plain(self, base: np.ndarray, values: Mapping[str, float]) -> tuple[JointFit, Scales]:
-        """The plain model beside joints of which more is known than theirs, and the sizes of its motion."""
-        row = base[self.spec.joint].copy()
-        for key, value in values.items():
-            row[BASELINE_PARAMETERS[key].column] = value
-        (scales,) = self.ask([partial(JointProblem.scales, row=row, residual=self.spec.floor)])
-        call = partial(JointProblem.fit, base=base, effects=(), starts=[values], scales=scales)
-        (fit,) = self.ask([call])
-        row = fit.rows[self.spec.joint]
-        (scales,) = self.ask([partial(JointProblem.scales, row=row, residual=fit.rmse)])
-        return fit, scales
 
     def candidates(self) -> tuple[list[str], dict[str, str], dict[str, tuple[str, ...]]]:
         """Effects that models may have; those that are not tried, with the reason; what effects stand for."""
@@ -260,7 +248,7 @@ STAGES = 12
 
 def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
     """Values of a baseline's parameters in a row [PARAMETER_COLUMNS], by key."""
-    return {key: float(row[BASELINE_PARAMETERS[key].column]) for key in keys}
+    return {key: float(row[PARAMETERS[key].column]) for key in keys}
 
 
 def _workers(problems: Problems, options: Options) -> WorkerPool:
@@ -320,7 +308,7 @@ def _identify(
     fits = []
     for number, spec in enumerate(specs):
         chain = chains[spec.chain]
-        fit = _plain(pool, spec, chain.start_row)
+        ((fit, _),) = pool.run(spec, [partial(JointProblem.plain, base=chain.start_row)])
         fits.append(fit)
         share = 100.0 * (number + 1) / len(specs)
         line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
@@ -333,17 +321,6 @@ def _identify(
         for other, beside in zip(specs, fits, strict=True):
             if other.chain == spec.chain:
                 rows[other.joint] = beside.rows[other.joint]
-        again.append(_plain(pool, spec, rows))
+        ((fit, _),) = pool.run(spec, [partial(JointProblem.plain, base=rows)])
+        again.append(fit)
     return again
-
-
-def _plain(pool: WorkerPool, spec: JointSpec, base: np.ndarray) -> JointFit:
-    """A joint's plain model, fitted from rows of its chain."""
-    scale = partial(JointProblem.scales, row=base[spec.joint], residual=spec.floor)
-    (scales,) = pool.run(spec, [scale])
-    # One speed limit as it is, one that binds, one that does not.
-    limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
-    starts = [{}, *limits]
-    call = partial(JointProblem.fit, base=base, effects=(), starts=starts, scales=scales)
-    (fit,) = pool.run(spec, [call])
-    return fit
