@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.policy.senses import Senses
-from vd.train.student.sequences import Sequences, flow_loss
+from vd.train.student.sequences import Looks, flow_loss
 from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
 from vd.vision.inputs import Belief, HandFrames, InputBuilder, StudentInput, carried, each
@@ -80,43 +80,43 @@ def test_without_weights_it_does_nothing_and_believes_what_it_did():
         for weight in network.parameters():
             weight.zero_()
     for seed in range(2):
-        sight = sights((2, 3), seed)
-        output = network(sight, network.first_hidden(3))
-        assert not output.action.any()
-        torch.testing.assert_close(output.belief.rotation, sight.belief.rotation)
-        torch.testing.assert_close(output.belief.position, sight.belief.position)
-        assert (output.log_distance == 0.0).all()
+        sight = sights((3,), seed)
+        look, decision = network.act(sight, network.first_hidden(3))
+        assert not decision.action.any()
+        torch.testing.assert_close(look.belief.rotation, sight.belief.rotation)
+        torch.testing.assert_close(look.belief.position, sight.belief.position)
+        assert (decision.log_distance == 0.0).all()
 
 
 def test_what_it_says_depends_on_every_thing_that_it_reads():
     network = student()
     sight = sights((2,))
-    output = network.act(sight, network.first_hidden(2))
+    _, decision = network.act(sight, network.first_hidden(2))
     other = sights((2,), seed=1)
     for field in dataclasses.fields(StudentInput):
         if field.name == "frame":  # which only tells how the rest is given
             continue
         changed = dataclasses.replace(sight, **{field.name: getattr(other, field.name)})
-        found = network.act(changed, network.first_hidden(2))
-        assert (found.action != output.action).any(dim=1).all(), field.name
-    remembered = network.act(sight, output.hidden)
-    assert (remembered.action != output.action).any(dim=1).all()
+        _, found = network.act(changed, network.first_hidden(2))
+        assert (found.action != decision.action).any(dim=1).all(), field.name
+    _, remembered = network.act(sight, decision.hidden)
+    assert (remembered.action != decision.action).any(dim=1).all()
 
 
 def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
     network = student()
-    sight = sights((4, 3))
+    steps = [sights((3,), seed) for seed in range(4)]
+    features = torch.stack([network.look(sight).features for sight in steps])
     done = torch.zeros((4, 3), dtype=torch.bool)
     done[1, 0] = done[3, 2] = True
-    whole = network(sight, torch.ones(3, SMALL.memory), done)
+    whole = network(features, torch.ones(3, SMALL.memory), done)
     hidden = torch.ones(3, SMALL.memory)
-    for step in range(4):
-        output = network.act(each(sight, lambda value, step=step: value[step]), hidden)
-        hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
+    for step, sight in enumerate(steps):
+        _, decision = network.act(sight, hidden)
+        hidden = decision.hidden.masked_fill(done[step, :, None], 0.0)
         for name in ("action", "log_distance"):
-            found = getattr(output, name)
+            found = getattr(decision, name)
             torch.testing.assert_close(found, getattr(whole, name)[step], atol=1e-5, rtol=1e-4)
-        torch.testing.assert_close(output.belief.rotation, whole.belief.rotation[step])
     torch.testing.assert_close(hidden, whole.hidden)
     assert not hidden[2].any()
 
@@ -130,10 +130,11 @@ def test_a_scene_moved_with_the_belief_looks_the_same():
     moved = dataclasses.replace(
         sight, camera=sight.camera + shift, hand=sight.hand + shift, belief=belief
     )
-    seen = network.look(sight).embedding
-    torch.testing.assert_close(network.look(moved).embedding, seen, atol=2e-3, rtol=0.0)
-    aside = dataclasses.replace(sight, belief=belief)
-    assert (network.look(aside).embedding - seen).abs().max() > 0.05
+    seen = network.look(sight).features[:, : network.pooled]
+    again = network.look(moved).features[:, : network.pooled]
+    torch.testing.assert_close(again, seen, atol=2e-3, rtol=0.0)
+    aside = network.look(dataclasses.replace(sight, belief=belief))
+    assert (aside.features[:, : network.pooled] - seen).abs().max() > 0.05
 
 
 def test_it_reads_nothing_out_of_reach():
@@ -145,7 +146,7 @@ def test_it_reads_nothing_out_of_reach():
         points = sight.belief.position[:, None] + step * (far - sight.belief.position[:, None])
         camera = torch.cat([sight.camera, points], dim=1)
         found = network.look(dataclasses.replace(sight, camera=camera))
-        assert torch.allclose(found.embedding, read.embedding, atol=1e-6) != seen
+        assert torch.allclose(found.features, read.features, atol=1e-6) != seen
         assert (found.voxels == read.voxels + seen).all()
 
 
@@ -339,22 +340,21 @@ def truth_of(sight: StudentInput) -> Belief:
 def test_it_learns_how_a_belief_is_wrong():
     """Eight objects half a radian off are turned right after a few dozen steps."""
     network = student().train()
-    sight = sights((1, 8), points=200)
-    truth = truth_of(sight)
-    off = turn_angle(sight.belief.rotation @ truth.rotation.transpose(-1, -2))
-    torch.testing.assert_close(off, torch.full((1, 8), 0.5), atol=1e-3, rtol=0.0)
-    done = torch.zeros((1, 8), dtype=torch.bool)
-    sequences = Sequences(sight, truth, network.first_hidden(8), done)
+    sight = sights((8,), points=200)
+    looks = Looks(sight, truth_of(sight))
+    turn = looks.truth.rotation.mT
+    torch.testing.assert_close(
+        turn_angle(sight.belief.rotation @ turn), torch.full((8,), 0.5), atol=1e-3, rtol=0.0
+    )
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
     for _ in range(60):
-        output = network(sight, network.first_hidden(8))
-        loss = flow_loss(output, sequences)
+        look = network.look(sight)
+        loss = flow_loss(look.flow, looks)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    left = turn_angle(output.belief.rotation @ truth.rotation.transpose(-1, -2))
-    assert left.mean() < 0.15
-    assert output.flow.log_scale.mean() < 0.0
+    assert turn_angle(look.belief.rotation @ turn).mean() < 0.15
+    assert look.flow.log_scale.mean() < 0.0
 
 
 class Told(torch.nn.Module):
@@ -408,15 +408,15 @@ def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
 def test_it_learns_in_half_precision(device):
     place = torch.device(wp.device_to_torch(device))
     network = student().train().to(place)
-    sight = each(sights((2, 3)), lambda value: value.to(place))
-    single = network(sight, network.first_hidden(3))
+    sight = each(sights((6,)), lambda value: value.to(place))
+    hidden = torch.ones((6, SMALL.memory), device=place)
+    single, decided = network.act(sight, hidden)
     network.half = True
-    output = network(sight, network.first_hidden(3))
-    assert output.action.dtype == output.belief.rotation.dtype == torch.float32
-    torch.testing.assert_close(output.action, single.action, atol=0.02, rtol=0.02)
-    assert (output.action != single.action).any()
-    spoken = [output.action, output.log_distance]
-    spoken += [output.flow.shift, output.flow.log_scale]
+    look, decision = network.act(sight, hidden)
+    assert decision.action.dtype == look.belief.rotation.dtype == torch.float32
+    torch.testing.assert_close(decision.action, decided.action, atol=0.02, rtol=0.02)
+    assert (look.flow.shift != single.flow.shift).any()
+    spoken = [decision.action, decision.log_distance, look.flow.shift, look.flow.log_scale]
     sum(value.square().sum() for value in spoken).backward()
     for name, weight in network.named_parameters():
         assert torch.isfinite(weight.grad).all(), name
@@ -427,11 +427,11 @@ def test_a_robot_runs_its_stages_in_half_precision():
     network = student()
     sight = sights((2,))
     with torch.inference_mode():
-        single = network.act(sight, network.first_hidden(2))
+        _, single = network.act(sight, network.first_hidden(2))
         network.stages.bfloat16()
-        output = network.act(sight, network.first_hidden(2))
-    torch.testing.assert_close(output.action, single.action, atol=0.02, rtol=0.02)
-    assert output.hidden.dtype == torch.float32
+        _, decision = network.act(sight, network.first_hidden(2))
+    torch.testing.assert_close(decision.action, single.action, atol=0.02, rtol=0.02)
+    assert decision.hidden.dtype == torch.float32
 
 
 def test_a_robot_needs_no_simulator():
@@ -447,7 +447,7 @@ joints = torch.zeros(1, 9)
 frame = torch.zeros(1).long()
 sight = StudentInput(points, points, points, belief.rotation, joints, points, belief, frame)
 student = Student(StudentCfg(channels=(8,), blocks=0), 3, 5).eval()
-print(student.act(sight, student.first_hidden(1)).action.shape[1], *sys.modules)
+print(student.act(sight, student.first_hidden(1))[1].action.shape[1], *sys.modules)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     printed = run.stdout.split()

@@ -2,7 +2,6 @@
 
 import dataclasses
 from dataclasses import replace
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +19,11 @@ from vd.train.checkpoint import list_checkpoints
 from vd.train.student import made
 from vd.train.student.build import build_student
 from vd.train.student.config import StudentTrainCfg, smoke
-from vd.train.student.sequences import belief_errors, student_losses
+from vd.train.student.sequences import Sequences, acting_losses, belief_errors, flow_loss
 from vd.vision.acting import StudentPolicy
 from vd.vision.cfg import StudentCfg
-from vd.vision.inputs import Belief, carried, each
-from vd.vision.rotations import turn_angle
-from vd.vision.student import rigid_motion
+from vd.vision.inputs import Belief, carried
+from vd.vision.student import Decision, rigid_motion
 
 TINY = StudentCfg(
     channels=(8, 16), blocks=1, embedding=32, flow=32, senses=16, memory=32, head=32, voxel_m=0.01
@@ -35,7 +33,13 @@ TINY = StudentCfg(
 def settings(stage: int, out: Path, **learn) -> StudentTrainCfg:
     """A stage with a cube that is small enough to learn in seconds."""
     cfg = smoke(stage)
-    learn = {"window": 3, "batch": 4, "learning_rate": 3e-3, "warmup_steps": 0} | learn
+    learn = {
+        "window": 3,
+        "batch": 4,
+        "sequences": 4,
+        "learning_rate": 3e-3,
+        "warmup_steps": 0,
+    } | learn
     return replace(
         cfg,
         smoke=False,
@@ -58,81 +62,95 @@ def weights(trainer) -> torch.Tensor:
 
 @pytest.mark.parametrize("stage", [0, 1, 2])
 def test_every_stage_learns_what_it_is_shown(stage, tmp_path):
-    """The same few sequences again and again: their losses fall."""
+    """The same few looks and sequences again and again: their losses fall."""
     trainer = trainer_of(settings(stage, tmp_path))
-    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    looks = next(trainer.source.looks(trainer.acting))
+    sequences = next(trainer.source.sequences(), None)
+    assert (sequences is not None) == (stage > 0)
     first = {}
     for _ in range(25):
-        figures = trainer._step(sequences, 0.0)
+        figures = trainer.see(looks, 0.0)
+        if sequences is not None:
+            figures |= trainer.act(sequences, 0.0)
         first = first or figures
-    names = {"loss/flow", "loss/distance", "loss/action"}
-    assert names - {"loss/action"} <= figures.keys()
-    assert ("loss/action" in figures) == (stage > 0)
-    for name in names & figures.keys():
+    for name in {"loss/flow", "loss/distance", "loss/action"} & figures.keys():
         assert figures[name] < first[name], name
     assert figures["loss/flow"] < first["loss/flow"] - 0.5  # a likelihood half as large again
     trainer.close()
 
 
+def test_seeing_and_acting_learn_by_themselves(tmp_path):
+    trainer = trainer_of(settings(1, tmp_path))
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    before = {name: w.detach().clone() for name, w in trainer.network.named_parameters()}
+
+    def changed() -> set[str]:
+        now = trainer.network.named_parameters()
+        return {name.split(".")[0] for name, weight in now if (weight != before[name]).any()}
+
+    trainer.see(next(trainer.source.looks(trainer.acting)), 0.0)
+    eyes = changed()
+    assert eyes == {"stages", "flow"}
+    trainer.act(next(trainer.source.sequences()), 0.0)
+    rest = changed() - eyes
+    assert rest == {"project", "senses", "memory", "head", "action", "log_distance"}
+    trainer.close()
+
+
 @pytest.mark.parametrize("stage", [1, 2])
-def test_what_is_made_again_is_what_was_done(stage, tmp_path):
-    """In evaluation mode and without noise, a minibatch says what the rollout said."""
+def test_a_sequence_is_what_was_done(stage, tmp_path):
+    """In evaluation mode it says what the rollout said."""
     cfg = settings(stage, tmp_path)
-    cfg = replace(cfg, clouds=replace(cfg.clouds, noise_m=0.0))
     cfg = replace(cfg, simulated=replace(cfg.simulated, blank_probability=0.3))
     trainer = trainer_of(cfg)
-    source = trainer.source
     acting = trainer.acting
     trainer.network.eval()
-    if stage == 1:  # the same points of each surface in both
-        source.shapes = source.shapes[:, :200]
+    told = []
     said = []
     decide = acting.decide
-    acting.decide = lambda sight: said.append(decide(sight)) or said[-1]
-    env = source.env
+
+    def heard(sight):
+        look, decision = decide(sight)
+        told.append(look.features)
+        said.append(acting.build.frames.joints_in(decision.action, sight.frame))
+        return look, decision
+
+    acting.decide = heard
+    env = trainer.source.env
     env.episode_length_buf = torch.full((4,), env.max_episode_length - 2)  # ends inside
-    before = acting.hidden
-    hidden = source.collect(acting, lambda: False)
-    assert hidden is before
-    rows = torch.tensor([2, 0])
-    sequences = source.taken(acting, hidden, rows)
+    assert trainer.source.collect(acting, lambda: False)
+    sequences = next(trainer.source.sequences())
     assert sequences.done.any()
-    with torch.no_grad():
-        output = trainer.network(sequences.sight, sequences.hidden, sequences.done)
-    frames = acting.build.frames
-    for step, once in enumerate(said):
-        frame = sequences.sight.frame[step]
-        action = frames.joints_out(output.action[step], frame)
-        torch.testing.assert_close(action, once.action[rows], atol=1e-4, rtol=1e-3)
-        belief = frames.belief_out(each(output.belief, itemgetter(step)), frame)
-        turn = once.belief.rotation[rows]
-        torch.testing.assert_close(belief.rotation, turn, atol=1e-4, rtol=1e-3)
-    if stage == 2:
-        assert source.blank.any() or torch.isnan(sequences.sight.camera).all(-1).all(-1).any()
+    same = (sequences.features[:, :, None] == torch.stack(told)[:, None]).all(dim=-1).all(dim=0)
+    assert (same.sum(dim=1) == 1).all()
+    rows = same.int().argmax(dim=1)
+    decision = trainer.network(sequences.features, sequences.hidden, sequences.done)
+    torch.testing.assert_close(decision.action, torch.stack(said)[:, rows], atol=1e-5, rtol=1e-4)
+    assert float(sequences.label.abs().max()) <= 1.0
     trainer.close()
 
 
 def test_truth_is_where_the_objects_points_are(tmp_path):
     trainer = trainer_of(settings(1, tmp_path))
-    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
-    sight = sequences.sight
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    looks = next(trainer.source.looks(trainer.acting))
     apart = []
-    for belief in (sequences.truth, sight.belief):
-        laid = carried(sight.goal, belief.rotation, belief.position[..., None, :])
-        apart.append(torch.cdist(laid, sight.camera).amin(dim=-1).median())
+    for belief in (looks.truth, looks.sight.belief):
+        laid = carried(looks.sight.goal, belief.rotation, belief.position[:, None])
+        apart.append(torch.cdist(laid, looks.sight.camera).amin(dim=-1).median())
     assert apart[0] < 0.008  # two clouds of 200 points of one surface
     assert apart[1] > 1.5 * apart[0]
-    assert float(sequences.label.abs().max()) <= 1.0
     trainer.close()
 
 
 @pytest.mark.parametrize("stage", [0, 1])
 def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
-    cfg = settings(stage, tmp_path, batch=64)
+    cfg = settings(stage, tmp_path, batch=64, window=1)
     trainer = trainer_of(replace(cfg, task=replace(cfg.task, num_envs=64)))
-    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
-    belief = each(sequences.sight.belief, lambda value: value[0])
-    turn, shift = belief_errors(belief, each(sequences.truth, lambda value: value[0]))
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    looks = next(trainer.source.looks(trainer.acting))
+    turn, shift = belief_errors(looks.sight.belief, looks.truth)
     assert turn.max() < made.AWAY_RAD + 1e-3
     assert turn.mean() == pytest.approx(0.5 * made.AWAY_RAD, abs=0.2)  # four deviations
     assert shift.max() < np.sqrt(3.0) * made.AWAY_M + 1e-6
@@ -141,29 +159,29 @@ def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
 
 def test_losses_are_least_at_the_truth(tmp_path):
     trainer = trainer_of(settings(0, tmp_path))
-    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
-    output = trainer.network(sequences.sight, sequences.hidden, sequences.done)
-    truth = sequences.truth
-    turn = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation
-    distance = turn_angle(turn).clamp(min=0.02).log()
-    label = torch.full_like(output.action, 0.3)
-    flow = output.flow
-    believed = each(sequences.sight.belief, lambda value: value[0])
-    moved = truth.rotation[0] @ believed.rotation.mT
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    looks = next(trainer.source.looks(trainer.acting))
+    truth = looks.truth
+    believed = looks.sight.belief
+    flow = trainer.network.look(looks.sight).flow
+    moved = truth.rotation @ believed.rotation.mT
     end = (moved[flow.look] @ flow.start[..., None])[..., 0]
-    end = end + (truth.position[0] - believed.position)[flow.look]
+    end = end + (truth.position - believed.position)[flow.look]
     sure = torch.full_like(flow.log_scale, -3.0)
     exact = replace(flow, shift=end - flow.start, log_scale=sure)
-    right = replace(output, flow=exact, log_distance=distance, action=label)
-    labelled = replace(sequences, label=label)
-    losses = student_losses(right, labelled, trainer.cfg.learn)
-    assert float(losses["flow"]) == pytest.approx(-9.0, abs=1e-3)
-    assert float(losses["distance"]) == 0.0
+    assert float(flow_loss(exact, looks)) == pytest.approx(-9.0, abs=1e-3)
     rotation, position = rigid_motion(exact, len(moved))
-    torch.testing.assert_close(rotation @ believed.rotation, truth.rotation[0], atol=1e-3, rtol=0.0)
-    torch.testing.assert_close(believed.position + position, truth.position[0])
-    assert float(losses["action"]) == 0.0
-    off = student_losses(replace(right, action=label + 0.1), labelled, trainer.cfg.learn)
+    torch.testing.assert_close(rotation @ believed.rotation, truth.rotation, atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(believed.position + position, truth.position)
+    label = torch.full((2, 4, 9), 0.3)
+    distance = torch.rand(2, 4)
+    hidden = torch.zeros(4, 1)
+    done = torch.zeros((2, 4), dtype=torch.bool)
+    sequences = Sequences(label, hidden, done, label, distance)
+    right = Decision(label, distance.clamp(min=0.02).log(), hidden)
+    losses = acting_losses(right, sequences, trainer.cfg.learn)
+    assert float(losses["action"]) == float(losses["distance"]) == 0.0
+    off = acting_losses(replace(right, action=label + 0.1), sequences, trainer.cfg.learn)
     assert float(off["action"]) == pytest.approx(0.01)
 
 

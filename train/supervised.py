@@ -1,6 +1,7 @@
 """Training by labels: one network, one optimiser, a learning rate that falls to the end."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -87,12 +88,15 @@ class SupervisedLoop(TrainingLoop):
             for value in self.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
 
-    def _descend(self, losses: dict[str, Tensor], done: float) -> dict[str, Tensor]:
+    def _descend(
+        self, losses: dict[str, Tensor], done: float, parameters: Sequence[nn.Parameter]
+    ) -> dict[str, Tensor]:
         """One optimiser step on the gradient of a sum, averaged over processes and clipped.
 
         Args:
             losses: Losses by name, whose sum it is.
             done: Share of the run that is done.
+            parameters: What is to learn.
 
         Returns:
             The losses, and the norm of the gradient before clipping, scalars on the device.
@@ -103,7 +107,6 @@ class SupervisedLoop(TrainingLoop):
         self.optimizer.param_groups[0]["lr"] = self._learn.learning_rate * warm * left
         self.optimizer.zero_grad()
         torch.stack(tuple(losses.values())).sum().backward()
-        parameters = list(self.network.parameters())
         if self.is_distributed:
             # Every process has to take part with every weight, also one whose loss does not reach
             # it.

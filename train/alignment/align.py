@@ -171,7 +171,8 @@ class AlignTrainer(SupervisedLoop):
         with self._half:
             residual = self.network(pairs.goal, pairs.seen, near)
         losses, error = alignment_losses(residual, pairs)
-        return self._descend(losses, done) | {"alignment/rotation_error": error.median()}
+        logged = self._descend(losses, done, list(self.network.parameters()))
+        return logged | {"alignment/rotation_error": error.median()}
 
     @torch.no_grad()
     def measure(self) -> dict[str, Tensor]:

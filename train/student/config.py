@@ -30,29 +30,27 @@ class LearnCfg:
     """What all stages learn, and how. Nothing here is tuned yet."""
 
     window: int = 16
-    """Steps of a sequence, through which gradients flow; stage 0 has one."""
-    batch: int = 128
-    """Sequences of an optimiser step on one GPU."""
-    learning_rate: float = 3e-4
+    """Steps of a sequence, through which gradients flow."""
+    batch: int = 512
+    """Looks of an optimiser step that learns to see."""
+    sequences: int = 256
+    """Sequences of an optimiser step that learns to act."""
+    learning_rate: float = 1e-3
     """Of AdamW, after the warm-up; it falls to nearly 0 along a cosine until --max-steps or
     --max-minutes.
     """
-    warmup_steps: int = 300
+    warmup_steps: int = 100
     """Optimiser steps over which the learning rate rises from 0, linearly."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the convolutions' products."""
-    action_weight: float = 1.0
-    """Of the squared error of the teacher's action, a mean over motors."""
-    flow_weight: float = 1.0
-    """Of the negative logarithm of the likelihood of the goal's shifts, a mean over voxels."""
     distance_weight: float = 0.1
-    """Of the squared error of the logarithm of the distance to the goal."""
+    """Of the squared error of the logarithm of the distance to the goal, beside the squared error of
+    the teacher's action."""
 
     def validate(self) -> None:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
-        require(self, "--learn.", "positive", "window batch learning_rate")
-        weights = "action_weight flow_weight distance_weight"
-        require(self, "--learn.", "zero or positive", f"warmup_steps {weights}")
+        require(self, "--learn.", "positive", "window batch sequences learning_rate")
+        require(self, "--learn.", "zero or positive", "warmup_steps distance_weight")
 
 
 @dataclass
@@ -87,7 +85,7 @@ class CloudsCfg:
 class SimulatedCfg:
     """Stages 1 and 2: what the student does in simulation, labelled by the teacher (DAgger)."""
 
-    epochs: int = 1
+    epochs: int = 4
     """Passes over what was done in an iteration."""
     led_share: float = 0.5
     """Share of the environments in which the teacher acts, and the student only watches: it learns
@@ -152,15 +150,12 @@ class StudentTrainCfg:
 
 def gpu(stage: Stage) -> StudentTrainCfg:
     """One GPU or several, half precision."""
-    learn = LearnCfg(precision="bf16")
-    if stage == MADE:  # as the trial that chose this network, but for twice the looks
-        learn = replace(learn, batch=512, learning_rate=1e-3, warmup_steps=100)
     return StudentTrainCfg(
         preset="gpu",
         stage=stage,
         run=RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000),
-        learn=learn,
-        task=StageTaskCfg(num_envs=1024 if stage == RENDERED else 2048),
+        learn=LearnCfg(precision="bf16"),
+        task=StageTaskCfg(num_envs=1024 if stage == RENDERED else 4096),
     )
 
 
@@ -189,8 +184,8 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         ),
         learn=LearnCfg(
             window=8,
-            batch=64 if stage == MADE else 8,
-            learning_rate=1e-3,
+            batch=64 if stage == MADE else 16,
+            sequences=8,
             warmup_steps=20,
         ),
         clouds=CloudsCfg(shapes=64, hands=32, updates=10, validate_every=10),
@@ -206,7 +201,7 @@ def smoke(stage: Stage) -> StudentTrainCfg:
         smoke=True,
         run=replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none"),
         student=replace(cfg.student, channels=(8, 16), voxel_m=0.01),
-        learn=replace(cfg.learn, window=2, batch=4),
+        learn=replace(cfg.learn, window=2, batch=4, sequences=4),
         clouds=replace(cfg.clouds, shapes=4, hands=4, updates=2),
         task=replace(cfg.task, num_envs=4),
     )

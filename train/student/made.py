@@ -5,7 +5,6 @@ B looks, P points.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from operator import itemgetter
 from typing import Any
 
 import torch
@@ -15,11 +14,11 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.policy.senses import Senses
 from vd.train.student.bank import ShapeBank, centred_points
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, belief_errors
+from vd.train.student.sequences import Looks, Sequences, belief_errors
 from vd.train.student.shapes import random_matrices, uniform
 from vd.train.student.views import Hands, camera_points, goal_points, posed
 from vd.vision.acting import PASSES, ActingStudent
-from vd.vision.inputs import Belief, carried, each
+from vd.vision.inputs import Belief, carried
 from vd.vision.rotations import matrices_about
 
 CLOUDS = 4
@@ -47,7 +46,7 @@ def off(truth: Belief) -> Belief:
 
 
 class MadeSequences:
-    """Draws looks at shapes, sequences of one step. Each iteration has new ones.
+    """Draws looks at shapes. Each iteration has new ones.
 
     So a run that goes on is exact.
 
@@ -78,18 +77,22 @@ class MadeSequences:
         if held_out:
             self._held_out = centred_points(held_out, points, device)
 
-    def minibatches(
-        self, acting: ActingStudent, stopping: Callable[[], bool]
-    ) -> Iterator[Sequences]:
-        """Looks at new shapes."""
+    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> bool:
+        """Make other shapes."""
         self._bank.renew(self._clouds.shapes)
+        return True
+
+    def looks(self, acting: ActingStudent) -> Iterator[Looks]:
+        """Looks at them."""
         for _ in range(self._clouds.updates):
-            if stopping():
-                return
             yield self.draw(acting, self._bank.draw(self._learn.batch))
 
+    def sequences(self) -> Iterator[Sequences]:
+        """None: nobody acts."""
+        yield from ()
+
     @torch.no_grad()
-    def draw(self, acting: ActingStudent, shapes: Tensor) -> Sequences:
+    def draw(self, acting: ActingStudent, shapes: Tensor) -> Looks:
         """A look at each of shapes, points [m] and normals [B, P, 6], by a belief that is wrong."""
         count, size = shapes.shape[:2]
         device = shapes.device
@@ -112,15 +115,7 @@ class MadeSequences:
             fresh=torch.zeros(count, dtype=torch.bool, device=device),
         )
         sight = acting.build(senses, off(truth))
-        truth = acting.build.frames.belief_in(truth, sight.frame)
-
-        def as_step(value: Tensor) -> Tensor:
-            return value[None]
-
-        hidden = acting.network.first_hidden(count)
-        return Sequences(
-            each(sight, as_step), each(truth, as_step), hidden, done=senses.fresh[None]
-        )
+        return Looks(sight, acting.build.frames.belief_in(truth, sight.frame))
 
     def figures(self) -> dict[str, Any]:
         """Nothing beside the losses."""
@@ -132,11 +127,11 @@ class MadeSequences:
         if self._held_out is None:
             return {}
         views = 1 + self._learn.batch // len(self._held_out)
-        sequences = self.draw(acting, self._held_out.repeat(views, 1, 1))
-        sight = each(sequences.sight, itemgetter(0))
+        looks = self.draw(acting, self._held_out.repeat(views, 1, 1))
+        sight = looks.sight
         for _ in range(PASSES):
             sight = replace(sight, belief=acting.network.look(sight).belief)
-        turn, shift = belief_errors(sight.belief, each(sequences.truth, itemgetter(0)))
+        turn, shift = belief_errors(sight.belief, looks.truth)
         return {
             "validation/rotation_error": turn.median(),
             "validation/position_error_mm": 1e3 * shift.median(),

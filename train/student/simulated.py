@@ -8,6 +8,7 @@ with a camera also its points). T steps, N environments, D joints, K points.
 
 import math
 from collections.abc import Callable, Iterator
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,12 @@ from vd.sensors.depth_camera import DepthCamera
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import StudentTrainCfg
 from vd.train.student.made import off
-from vd.train.student.sequences import Sequences, belief_errors, inputs_of
+from vd.train.student.sequences import Looks, Sequences, belief_errors
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
-from vd.vision.inputs import Belief, carried, each
-from vd.vision.rotations import quaternion_matrices
+from vd.vision.inputs import carried, each, joined
+from vd.vision.rotations import quaternion_matrices, turn_angle
 
 
 class SimulatedSequences:
@@ -75,57 +76,86 @@ class SimulatedSequences:
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
         led = round(cfg.simulated.led_share * env.num_envs)
-        self._led = torch.arange(env.num_envs, device=place)[:, None] < led
+        self._led = torch.arange(env.num_envs, device=place) < led
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
-        self._store: dict[str, Tensor] = {}
+        self._looks: Looks
+        self._done: Sequences
         self._means = StepMeans()
         length = math.ceil(2 * env.max_episode_length / cfg.learn.window)
         self._window = GoalWindow(length)
 
-    def minibatches(
-        self, acting: ActingStudent, stopping: Callable[[], bool]
-    ) -> Iterator[Sequences]:
-        """Act, then give what was done, all of an environment at once."""
-        hidden = self.collect(acting, stopping)
-        if hidden is None:
-            return
-        envs = self.env.num_envs
-        for _ in range(self._cfg.simulated.epochs):
-            order = torch.randperm(envs, device=self.blank.device)
-            for rows in order.split(self._cfg.learn.batch):
-                yield self.taken(acting, hidden, rows)
-
     @torch.no_grad()
-    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> Tensor | None:
-        """Act for T steps; the memory before the first of them, or None if it was cut short."""
+    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> bool:
+        """Act for T steps; false if it was cut short."""
+        window = self._cfg.learn.window
+        build = acting.build
+        learned = torch.randint_like(self.blank, window)  # of each environment one look
+        looks = []
+        steps = []
         hidden = acting.hidden
-        for step in range(self._cfg.learn.window):
+        for step in range(window):
             if stopping():
                 self._means.clear()
-                return None
+                return False
             pose = poses_in(self._base, self._pose)
+            place = build.belief_of(pose)
             senses = self.senses(pose)
-            sight = acting.look(senses, off(acting.build.belief_of(pose)))
+            sight = acting.look(senses, off(place))
+            truth = build.frames.belief_in(place, sight.frame)
+            look, decision = acting.decide(sight)
             label = self.labels()
-            self._keep(step, senses, acting.belief, pose, label)
-            output = acting.decide(sight)
-            turn, shift = belief_errors(output.belief, acting.build.belief_of(pose))
-            action = torch.where(self._led, label, output.action)
+            distance = turn_angle(truth.rotation.mT @ sight.goal_rotation)
+            named = build.frames.joints_in(label, sight.frame)
+            steps.append((look.features, named, distance, senses.fresh))
+            rows = (learned == step).nonzero()[:, 0]
+            looks.append(Looks(each(sight, itemgetter(rows)), each(truth, itemgetter(rows))))
+            turn, shift = belief_errors(look.belief, truth)
+            wrong = (decision.action - label).abs().mean(dim=1)
+            action = torch.where(self._led[:, None], label, decision.action)
             _, _, _, extras = self.env.step(action)
-            frames = self.env.env.symmetry_frames
-            if frames is not None:  # the teacher's, in every step anew as the student's
-                frames.choose(self._all, self._all)
-                frames.observe()
+            self._choose_frames()
             self._means.add(
                 {
                     "student/rotation_error": turn.mean(),
                     "student/position_error_mm": 1e3 * shift.mean(),
-                    "student/action_error": (output.action - label).abs().mean(),
+                    "student/action_error": wrong.mean(),
+                    "student/own_action_error": wrong[~self._led].mean(),
                     **extras["log"],
                 }
             )
         self.env.env.check()
-        return hidden
+        sights = joined([look.sight for look in looks])
+        self._looks = Looks(sights, joined([look.truth for look in looks]))
+        features, labels, distances, fresh = map(torch.stack, zip(*steps, strict=True))
+        self._done = Sequences(
+            features=features,
+            hidden=hidden.masked_fill(fresh[0, :, None], 0.0),
+            done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
+            label=labels,
+            distance=distances,
+        )
+        return True
+
+    def looks(self, acting: ActingStudent) -> Iterator[Looks]:
+        """A look of each environment."""
+        order = torch.randperm(self.env.num_envs, device=self.blank.device)
+        for rows in order.split(self._cfg.learn.batch):
+            taken = itemgetter(rows)
+            yield Looks(each(self._looks.sight, taken), each(self._looks.truth, taken))
+
+    def sequences(self) -> Iterator[Sequences]:
+        """What was done, all of an environment at once."""
+        done = self._done
+        for _ in range(self._cfg.simulated.epochs):
+            order = torch.randperm(self.env.num_envs, device=self.blank.device)
+            for rows in order.split(self._cfg.learn.sequences):
+                yield Sequences(
+                    features=done.features[:, rows],
+                    hidden=done.hidden[rows],
+                    done=done.done[:, rows],
+                    label=done.label[:, rows],
+                    distance=done.distance[:, rows],
+                )
 
     def senses(self, pose: Tensor) -> Senses:
         """What is sensed now, for true poses of the objects in the base frame [N, 7]."""
@@ -139,9 +169,8 @@ class SimulatedSequences:
         spans = torch.randint_like(self.blank, 1, settings.blank_steps + 1)
         begins = (self.blank == 0) & (draw < settings.blank_probability)
         self.blank = torch.where(begins, spans, (self.blank - 1).clamp(min=0))
-        # Rounded as it is kept, so that what is made again is the same.
-        points = senses.points.half().float()
-        return sensed_with(env, points.masked_fill((self.blank > 0)[:, None, None], torch.nan))
+        points = senses.points.masked_fill((self.blank > 0)[:, None, None], torch.nan)
+        return sensed_with(env, points)
 
     def labels(self) -> Tensor:
         """What the teacher does now, clipped as the environment clips actions [N, D]."""
@@ -152,32 +181,12 @@ class SimulatedSequences:
             action = wp.to_torch(env.symmetry_frames.world_action(in_frames))
         return action.clamp(-1.0, 1.0)
 
-    def taken(self, acting: ActingStudent, hidden: Tensor, rows: Tensor) -> Sequences:
-        """What was done in the environments ``rows`` [B]; clouds are made again."""
-        kept = {name: values[:, rows] for name, values in self._store.items()}
-        label = kept.pop("label")
-        belief = Belief(kept.pop("rotation"), kept.pop("position"))
-        pose = kept.pop("pose")
-        steps = len(pose)
-        poses = pose.flatten(0, 1)
-        of_poses = rows.repeat(steps)
-        if self._camera is None:
-            points = self._complete(poses, of_poses).unflatten(0, (steps, len(rows)))
-        else:
-            points = kept["points"].float()
-        senses = Senses(**(kept | {"points": points}))
-        fresh = kept["fresh"]
-        sight = inputs_of(acting.build, senses, belief, rows)
-        frames = acting.build.frames
-        frame = sight.frame.flatten()
-        truth = frames.belief_in(acting.build.belief_of(poses, of_poses), frame)
-        return Sequences(
-            sight=sight,
-            truth=each(truth, lambda value: value.unflatten(0, (steps, len(rows)))),
-            hidden=hidden[rows].masked_fill(fresh[0, :, None], 0.0),
-            done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
-            label=frames.joints_in(label.flatten(0, 1), frame).unflatten(0, label.shape[:2]),
-        )
+    def _choose_frames(self) -> None:
+        """Let the teacher choose its symmetry frames anew, as the student does in every step."""
+        frames = self.env.env.symmetry_frames
+        if frames is not None:
+            frames.choose(self._all, self._all)
+            frames.observe()
 
     def figures(self) -> dict[str, Any]:
         """How goals ended, and errors while acting."""
@@ -219,16 +228,3 @@ class SimulatedSequences:
         shapes = self._scale[rows] * self.shapes[self._object[rows]][:, order]
         points = carried(shapes, quaternion_matrices(pose[:, 3:]), pose[:, None, :3])
         return points + clouds.noise_m * torch.randn_like(points)
-
-    def _keep(self, step: int, senses: Senses, belief: Belief, pose: Tensor, label: Tensor) -> None:
-        """Write a step into the store [T, N, ..]."""
-        values = vars(senses) | vars(belief) | {"pose": pose, "label": label}
-        if self._camera is None:
-            del values["points"]  # they are made again
-        else:
-            values["points"] = senses.points.half()
-        for name, value in values.items():
-            if name not in self._store:
-                shape = (self._cfg.learn.window, *value.shape)
-                self._store[name] = value.new_empty(shape)
-            self._store[name][step] = value

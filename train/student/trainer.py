@@ -12,16 +12,22 @@ from vd.policy.contract import Contract
 from vd.train.checkpoint import POLICY_NAME
 from vd.train.student.config import StudentTrainCfg
 from vd.train.student.made import MadeSequences
-from vd.train.student.sequences import Sequences, last_errors, student_losses
+from vd.train.student.sequences import (
+    Looks,
+    Sequences,
+    acting_losses,
+    belief_errors,
+    flow_loss,
+)
 from vd.train.student.simulated import SimulatedSequences
 from vd.train.supervised import SupervisedLoop
 from vd.vision.acting import ActingStudent, StudentPolicy
-from vd.vision.inputs import Belief, each
+from vd.vision.inputs import Belief
 from vd.vision.student import Student
 
 
 class StudentTrainer(SupervisedLoop):
-    """Trains a student on the sequences of a stage.
+    """Trains a student on the looks and sequences of a stage.
 
     While it acts, batch norms use their running statistics, as they do at work.
 
@@ -58,6 +64,10 @@ class StudentTrainer(SupervisedLoop):
         self.source = source
         self.cfg = cfg
         self.contract = contract
+        network = acting.network
+        self._seeing = [*network.stages.parameters(), *network.flow.parameters()]
+        seeing = set(self._seeing)
+        self._acting = [weight for weight in network.parameters() if weight not in seeing]
         self.network.half = cfg.learn.precision == "bf16"
 
     def _samples(self) -> int:
@@ -65,31 +75,43 @@ class StudentTrainer(SupervisedLoop):
 
     def _iterate(self) -> dict[str, Any] | None:
         done = self._done()
-        steps = []
         self.network.eval()
-        for sequences in self.source.minibatches(self.acting, self._stopping):
-            steps.append(self._step(sequences, done))
-            self.network.eval()
-        if not steps or self._stopping():
+        if not self.source.collect(self.acting, self._stopping):
             return None
+        seen = []
+        for looks in self.source.looks(self.acting):
+            if self._stopping():
+                return None
+            seen.append(self.see(looks, done))
+        acted = [self.act(sequences, done) for sequences in self.source.sequences()]
+        self.network.eval()
+        figures = self._figures(seen)
+        if acted:
+            figures |= self._figures(acted)
         self._share_statistics()
-        return self._figures(steps) | self.source.figures()
+        return figures | self.source.figures()
 
     def measure(self) -> dict[str, Tensor]:
         """Errors on what is not learned from; empty for none."""
         return self.source.measure(self.acting)
 
-    def _step(self, sequences: Sequences, done: float) -> dict[str, Tensor]:
-        """One optimiser step; its losses and errors."""
+    def see(self, looks: Looks, done: float) -> dict[str, Tensor]:
+        """One optimiser step of what sees; its loss and errors."""
         self.network.train()
-        output = self.network(sequences.sight, sequences.hidden, sequences.done)
-        losses = student_losses(output, sequences, self.cfg.learn)
-        logged = self._descend(losses, done)
-        last = each(output.belief, lambda value: value[-1].detach())
-        turn, shift = last_errors(last, sequences)
+        look = self.network.look(looks.sight)
+        losses = {"flow": flow_loss(look.flow, looks)}
+        logged = self._descend(losses, done, self._seeing)
+        turn, shift = belief_errors(look.belief, looks.truth)
         logged["learn/rotation_error"] = turn.mean()
         logged["learn/position_error_mm"] = 1e3 * shift.mean()
         return logged
+
+    def act(self, sequences: Sequences, done: float) -> dict[str, Tensor]:
+        """One optimiser step of what acts; its losses."""
+        self.network.train()
+        decision = self.network(sequences.features, sequences.hidden, sequences.done)
+        losses = acting_losses(decision, sequences, self.cfg.learn)
+        return self._descend(losses, done, self._acting)
 
     def _share_statistics(self) -> None:
         """Average the batch norms' running statistics over the processes."""

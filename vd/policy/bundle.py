@@ -211,8 +211,8 @@ def _student_answers(network: Student, golden: Tensors) -> Tensors:
         frame=torch.zeros(STATES, dtype=torch.int64),
     )
     with torch.no_grad():
-        output = network.act(sight, network.first_hidden(STATES))
-    return {"action": output.action, "rotation": output.belief.rotation}
+        look, decision = network.act(sight, network.first_hidden(STATES))
+    return {"action": decision.action, "rotation": look.belief.rotation}
 
 
 def _part(tensors: Tensors, prefix: str) -> Tensors:

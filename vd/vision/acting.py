@@ -13,7 +13,7 @@ from vd.policy.contract import Contract, Contracted, StudentSpec
 from vd.policy.senses import CameraDecision, Senses
 from vd.vision.inputs import Belief, InputBuilder, StudentInput, each
 from vd.vision.rotations import cube_rotations
-from vd.vision.student import Student, StudentOutput
+from vd.vision.student import Decision, Look, Student
 
 LEAST_SEEN = 32
 """Points from which an object is looked for (ours): fewer tell little of its shape. Not tuned."""
@@ -125,27 +125,27 @@ class ActingStudent:
             self.belief.rotation[some] = belief.rotation[chosen]
             self.belief.position[some] = belief.position[chosen]
 
-    def decide(self, sight: StudentInput) -> StudentOutput:
-        """What the network says, in the base frame, which is believed and remembered from then on."""
-        output = self.network.act(sight, self.hidden)
+    def decide(self, sight: StudentInput) -> tuple[Look, Decision]:
+        """What the network sees, and decides in the order of the joints, which is remembered."""
+        look, decision = self.network.act(sight, self.hidden)
         frames = self.build.frames
-        belief = frames.belief_out(output.belief, sight.frame)
+        belief = frames.belief_out(look.belief, sight.frame)
         # One that strayed would have nothing in sight to come back by.
         self.belief = self.build.near_place(belief, self.network.cfg.reach_m)
-        self.hidden = output.hidden
-        action = frames.joints_out(output.action, sight.frame)
-        return replace(output, action=action, belief=belief)
+        self.hidden = decision.hidden
+        action = frames.joints_out(decision.action, sight.frame)
+        return look, replace(decision, action=action)
 
     @torch.no_grad()
     def step(self, senses: Senses) -> CameraDecision:
         """One control step."""
-        output = self.decide(self.look(senses))
+        look, decision = self.decide(self.look(senses))
         pose = self.pose
         turn = self._base[:, 3:]
         return CameraDecision(
-            action=output.action,
-            angle=output.log_distance.exp(),
+            action=decision.action,
+            angle=decision.log_distance.exp(),
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),
-            voxels=output.voxels,
+            voxels=look.voxels,
         )

@@ -9,7 +9,7 @@ N environments, R steps of them, T steps, V frames, G fingertips, A joints with 
 of the hand, or that turned; metres, radians.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -74,6 +74,15 @@ def each(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
             value = change(value)
         values[field.name] = value
     return type(step)(**values)
+
+
+def joined(steps: Sequence[Step]) -> Step:
+    """Steps one after the other, along their first axis."""
+    values: dict[str, Any] = {}
+    for field in fields(steps[0]):  # type: ignore[arg-type]
+        parts = [getattr(step, field.name) for step in steps]
+        values[field.name] = joined(parts) if isinstance(parts[0], Belief) else torch.cat(parts)
+    return type(steps[0])(**values)
 
 
 def carried(points: Tensor, rotation: Tensor, position: Tensor | float = 0.0) -> Tensor:

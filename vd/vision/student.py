@@ -4,22 +4,20 @@ One sparse tensor holds what the camera sees, the hand's own points by its joint
 cloud, each kind in channels of its own. The goal's cloud is laid where the object is believed to
 be, so what is wrong with the belief shows as a shift between two surfaces, wherever the object is.
 The network predicts for each voxel of the goal by how much it is to move, and how sure that is; the
-rigid motion that fits these shifts best makes the belief better, and the network acts on that. A
-GRU carries over steps what one look does not show.
+rigid motion that fits these shifts best makes the belief better.
 
-What it then believes is told its memory and its head as numbers: how far the fingertips are from
-the goal's cloud laid there, how far that extends, and the wanted rotation.
+What it then believes is told its memory and its head as numbers, beside what its convolutions saw:
+how far the fingertips are from the goal's cloud laid there, how far that extends, and the wanted
+rotation. A GRU carries over steps what one look does not show.
 
-The voxels of a step depend on the belief that the step before left. So a sequence can only be
-encoded at once if its beliefs are those of the rollout: training stores them beside the rest of a
-:class:`StudentInput`, as data through which no gradient flows, and teaches the shifts from each
-stored belief to the truth.
+Seeing learns from single looks and acting from sequences of what was seen: no gradient flows from
+one to the other. So to learn to act is cheap, and each gets as many optimiser steps as it needs.
 
 N environments, T steps, R looks, V voxels of goals in all of them, A actions, F fingertips, E the
 embedding, G the memory. The frames of :mod:`vd.vision.inputs`; metres, radians.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise, product
 
 import torch
@@ -27,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vd.vision.cfg import StudentCfg
-from vd.vision.inputs import Belief, StudentInput, carried, each
+from vd.vision.inputs import Belief, StudentInput, carried
 from vd.vision.rotations import first_columns, matrices
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
 
@@ -69,8 +67,8 @@ class Flow:
 class Look:
     """What R looks show, without memory."""
 
-    embedding: Tensor
-    """For the memory [R, E]."""
+    features: Tensor
+    """What is told of it, through which no gradient flows [R, S]."""
     belief: Belief
     """The better belief [R]."""
     doubt: Tensor
@@ -82,21 +80,15 @@ class Look:
 
 
 @dataclass(frozen=True)
-class StudentOutput:
-    """What a student says of a step; leading axes [N] or [T, N], the memory's [N]."""
+class Decision:
+    """What a student decides; leading axes [N] or [T, N]."""
 
     action: Tensor
     """The action, not clipped [.., A]."""
-    belief: Belief
-    """The better belief; detached it is the next step's."""
     log_distance: Tensor
     """Logarithm of the angle to the goal [rad] [..]."""
-    voxels: Tensor
-    """How many voxels hold points of the camera and none of the hand [..]."""
     hidden: Tensor
     """Memory after the last step [N, G]."""
-    flow: Flow
-    """The shifts of all steps."""
 
 
 @torch.no_grad()
@@ -156,6 +148,8 @@ class VoxelStage(nn.Module):
 class Student(nn.Module):
     """From what is seen and sensed to the action, with memory (the paper's Figure 7).
 
+    :meth:`look` sees, :meth:`forward` decides by what was told of looks.
+
     Its stages multiply in their weights' precision: ``stages.bfloat16()`` is for a robot's
     computer, ``half`` for learning. Geometry is computed in single precision; so call it outside
     of autocast.
@@ -180,12 +174,13 @@ class Student(nn.Module):
         self.stages = nn.Sequential()
         for inputs, outputs in pairwise(widths):
             self.stages.append(VoxelStage(inputs, outputs, cfg.blocks))
+        self.pooled = 2 * widths[-1]
         self.project = nn.Sequential(
-            nn.Linear(2 * widths[-1], cfg.embedding),
+            nn.Linear(self.pooled, cfg.embedding),
             nn.LayerNorm(cfg.embedding),
         )
         self.flow = nn.Sequential(
-            nn.Linear(sum(widths[1:]) + 2 * widths[-1] + 6, cfg.flow),
+            nn.Linear(sum(widths[1:]) + self.pooled + 6, cfg.flow),
             nn.GELU(),
             nn.Linear(cfg.flow, cfg.flow),
             nn.GELU(),
@@ -242,7 +237,8 @@ class Student(nn.Module):
         )
         of_look = torch.bincount(flow.look, minlength=looks)
         doubt = torch.segment_reduce(flow.log_scale, "mean", lengths=of_look, unsafe=True)
-        return Look(self.project(pooled), better, doubt, seen, flow)
+        features = torch.cat([pooled, doubt[:, None], self._told(sight, better)], dim=1)
+        return Look(features.detach(), better, doubt, seen, flow)
 
     def _convolve(self, voxels: SparseTensor) -> list[SparseTensor]:
         """Features of the cells of each stage."""
@@ -278,55 +274,38 @@ class Student(nn.Module):
             look=look,
         )
 
-    def forward(
-        self, sight: StudentInput, hidden: Tensor, done: Tensor | None = None
-    ) -> StudentOutput:
-        """Read a sequence.
+    def forward(self, features: Tensor, hidden: Tensor, done: Tensor | None = None) -> Decision:
+        """Decide in a sequence of steps.
 
         Args:
-            sight: What was sensed in each step [T, N].
+            features: What was told of the look of each step [T, N, S].
             hidden: Memory before the first step [N, G].
             done: Where step t was the last of an episode, bool [T, N]: t + 1 begins without memory.
         """
-        flat = self.look(each(sight, lambda value: value.flatten(0, 1)))
-        lead = sight.camera.shape[:2]
-
-        def of_steps(value: Tensor) -> Tensor:
-            return value.unflatten(0, lead)
-
-        better = each(flat.belief, of_steps)
-        doubt = of_steps(flat.doubt.detach())[..., None]
-        told = [sight.proprioception, doubt, self._believed(sight, better)]
-        sensed = self.senses(torch.cat(told, dim=-1))
-        inputs = torch.cat([of_steps(flat.embedding), sensed], dim=-1)
+        seen, told = features.split([self.pooled, features.shape[-1] - self.pooled], dim=-1)
+        sensed = self.senses(told)
+        inputs = torch.cat([self.project(seen), sensed], dim=-1)
         remembered, hidden = self._remember(inputs, hidden, done)
-        features = self.head(torch.cat([remembered, sensed], dim=-1))
-        return StudentOutput(
-            action=self.action(features),
-            belief=better,
-            log_distance=self.log_distance(features).squeeze(-1),
-            voxels=of_steps(flat.voxels),
-            hidden=hidden,
-            flow=flat.flow,
-        )
+        decided = self.head(torch.cat([remembered, sensed], dim=-1))
+        return Decision(self.action(decided), self.log_distance(decided).squeeze(-1), hidden)
 
-    def act(self, sight: StudentInput, hidden: Tensor) -> StudentOutput:
-        """One step of N hands: what :meth:`forward` says of it, leading axis [N]."""
-        sequence = each(sight, lambda value: value[None])
-        output = self(sequence, hidden)
-        step = each(output, lambda value: value[0])
-        return replace(step, hidden=output.hidden)
+    def act(self, sight: StudentInput, hidden: Tensor) -> tuple[Look, Decision]:
+        """Look, and decide: one step of N hands, leading axes [N]."""
+        look = self.look(sight)
+        step = self(look.features[None], hidden)
+        return look, Decision(step.action[0], step.log_distance[0], step.hidden)
 
     def _within_reach(self, points: Tensor) -> Tensor:
         """Points [.., 3] about the object's place; NaN for those that are out of reach."""
         far = points.norm(dim=-1, keepdim=True) > self.cfg.reach_m
         return points.masked_fill(far, torch.nan)
 
-    def _believed(self, sight: StudentInput, belief: Belief) -> Tensor:
-        """From the goal to the object as two columns, its place, and its surface [.., 9 + 3 F + 52].
+    def _told(self, sight: StudentInput, belief: Belief) -> Tensor:
+        """What is told beside what convolutions saw [R, 3 A + 9 + 3 F + 52].
 
-        Of the surface: the way from each fingertip to the nearest point, and how far it extends
-        from its middle in :data:`DIRECTIONS`, as it lies and as it is to lie.
+        Joints and the last action; from the goal to the object as two columns, its place, and its
+        surface: the way from each fingertip to the nearest point, and how far it extends from its
+        middle in :data:`DIRECTIONS`, as it lies and as it is to lie.
         """
         turn = belief.rotation @ sight.goal_rotation.mT
         laid = carried(sight.goal, belief.rotation)
@@ -334,7 +313,8 @@ class Student(nn.Module):
         tips = sight.tips - belief.position[..., None, :]
         nearest = torch.cdist(tips, laid).argmin(dim=-1, keepdim=True)
         way = laid.gather(-2, nearest.expand_as(tips)) - tips
-        told = [first_columns(turn), belief.position / PLACE_M, way.flatten(-2) / NEAR_M]
+        told = [sight.proprioception, first_columns(turn), belief.position / PLACE_M]
+        told.append(way.flatten(-2) / NEAR_M)
         for cloud in (laid, wanted):
             extent = (cloud @ self.directions.T).amax(dim=-2)
             told.append((extent - EXTENT_M) / NEAR_M)
