@@ -87,9 +87,6 @@ class SimulatedCfg:
 
     epochs: int = 4
     """Passes over what was done in an iteration."""
-    led_share: float = 0.5
-    """Share of the environments in which the teacher acts, and the student only watches: it learns
-    nothing of what it never comes to, and by itself comes to little at first."""
     blank_probability: float = 0.02
     """Stage 2: chance in a step that the camera goes blank for a while."""
     blank_steps: int = 8
@@ -100,7 +97,7 @@ class SimulatedCfg:
     def validate(self) -> None:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
         require(self, "--simulated.", "positive", "epochs blank_steps")
-        require(self, "--simulated.", "in [0, 1]", "blank_probability led_share")
+        require(self, "--simulated.", "in [0, 1]", "blank_probability")
 
 
 @dataclass

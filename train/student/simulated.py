@@ -75,8 +75,6 @@ class SimulatedSequences:
         self._all = wp.ones(env.num_envs, dtype=wp.int32, device=env.env.device)
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
-        led = round(cfg.simulated.led_share * env.num_envs)
-        self._led = torch.arange(env.num_envs, device=place) < led
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
         self._looks: Looks
         self._done: Sequences
@@ -110,16 +108,14 @@ class SimulatedSequences:
             rows = (learned == step).nonzero()[:, 0]
             looks.append(Looks(each(sight, itemgetter(rows)), each(truth, itemgetter(rows))))
             turn, shift = belief_errors(look.belief, truth)
-            wrong = (decision.action - label).abs().mean(dim=1)
-            action = torch.where(self._led[:, None], label, decision.action)
-            _, _, _, extras = self.env.step(action)
+            wrong = (decision.action - label).abs()
+            _, _, _, extras = self.env.step(decision.action)
             self._choose_frames()
             self._means.add(
                 {
                     "student/rotation_error": turn.mean(),
                     "student/position_error_mm": 1e3 * shift.mean(),
                     "student/action_error": wrong.mean(),
-                    "student/own_action_error": wrong[~self._led].mean(),
                     **extras["log"],
                 }
             )
