@@ -355,17 +355,17 @@ IMPORT_AND_MEASURE = """
 import resource, subprocess, sys
 subprocess.run([sys.executable, "-m", "vd.assets_usd.cli", "import", *sys.argv[1:]], check=True)
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(used.ru_utime + used.ru_stime, used.ru_maxrss)
+print(used.ru_maxrss)
 """
-"""Prints the processor time [s] and the largest resident memory [kB] of an import.
+"""Prints the largest resident memory of an import [kB].
 
 A process of its own, since what it starts would begin with the memory of the tests.
 """
 
 
 @pytest.mark.slow
-def test_a_scan_takes_no_more_time_and_memory_than_two_million_faces_may(tmp_path: Path):
-    """They may take a minute of two cores and 2 GB; a sixth of their faces takes half of that."""
+def test_a_scan_takes_no_more_memory_than_two_million_faces_may(tmp_path: Path):
+    """They may take 2 GB; a sixth of their faces takes half of that."""
     scan = trimesh.creation.icosphere(subdivisions=7, radius=0.06)
     scan.vertices[:, :2] *= 0.8 + 0.3 * np.cos(70.0 * scan.vertices[:, 2:])
     scan.export(tmp_path / "vase.stl")
@@ -376,9 +376,8 @@ def test_a_scan_takes_no_more_time_and_memory_than_two_million_faces_may(tmp_pat
         text=True,
         check=True,
     )
-    processor_s, memory_kb = map(float, run.stdout.split()[-2:])
+    memory_kb = float(run.stdout.split()[-1])
     assert len(scan.faces) == 327_680
-    assert processor_s < 60.0
     assert memory_kb < 1e6
     assert read_object(tmp_path / "out" / "vase.usd").warnings == ()
 
