@@ -9,6 +9,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ObservationCfg
 from vd.envs.symmetry_frames import symmetry_frames
@@ -57,3 +60,19 @@ class FrameMaps:
     def world_action(self, action: Array, frame: Array) -> Array:
         """Actions [N, D] of frames [N] with the joints in the world's order."""
         return self._sign[frame] * take_along(action, self._joints[frame], axis=1)
+
+
+def turns_of_hand(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The turns that put the fingers of a hand in each other's places; one where they are not alike.
+
+    Returns:
+        Matrices from the base frame to the V turned ones [V, 3, 3]; in the base frame, the direction
+        near which each has the axis of the wanted rotation [V, 3]; and the joint of the turned hand
+        that is each of the hand's, int [V, D].
+    """
+    try:
+        tables = symmetry_frames(hand, ObservationCfg(), "goal")
+    except ValueError:  # its fingers are not alike
+        return np.eye(3)[None], np.zeros((1, 3)), np.arange(hand.num_joints)[None]
+    to_world = Rotation.from_quat(hand.mount[3:]).as_matrix()
+    return to_world.T @ tables.turn @ to_world, tables.sector @ to_world, tables.joints

@@ -16,14 +16,12 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 import warp as wp
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from vd.assets_usd.hand_data import HandModel
-from vd.envs.cfg import ObservationCfg
-from vd.envs.symmetry_frames import symmetry_frames
 from vd.geometry.arrays import as_warp
 from vd.geometry.clouds import HandCloud
+from vd.geometry.frame_maps import turns_of_hand
 from vd.paper import PAPER
 from vd.policy.senses import Senses
 from vd.vision.rotations import quaternion_matrices, quaternions
@@ -108,24 +106,15 @@ class HandFrames:
     """
 
     def __init__(self, hand: HandModel, device: torch.device):
-        joints = np.arange(hand.num_joints)[None]
-        turn = np.eye(3)[None]
-        sector = np.zeros((1, 3))
-        try:
-            tables = symmetry_frames(hand, ObservationCfg(), "goal")
-        except ValueError:  # its fingers are not alike
-            fingers = np.arange(len(hand.tip_link))[None]
-        else:
-            to_world = Rotation.from_quat(hand.mount[3:]).as_matrix()
-            joints = tables.joints
-            turn = to_world.T @ tables.turn @ to_world
-            sector = tables.sector @ to_world
-            order = np.argsort(joints, axis=1)
+        turn, sector, joints = turns_of_hand(hand)
+        order = np.argsort(joints, axis=1)
+        fingers = np.arange(len(hand.tip_link))[None]
+        if len(turn) > 1:
             fingers = order[:, :: hand.joints_per_finger] // hand.joints_per_finger
         self.turn = torch.tensor(turn, dtype=torch.float32, device=device)
         self._sector = torch.tensor(sector, dtype=torch.float32, device=device)
         self._joints = torch.tensor(joints, device=device)
-        self._order = torch.argsort(self._joints, dim=1)
+        self._order = torch.tensor(order, device=device)
         self._fingers = torch.tensor(fingers, device=device)
 
     def choose(self, belief: Belief, goal_rotation: Tensor) -> Tensor:
