@@ -120,7 +120,7 @@ def test_two_nodes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs
     # One process goes on with what two have begun.
     alone = make_runner(tmp_path, env=DummyEnv(num_envs=8))
     alone.load(str(find_checkpoint(tmp_path, "latest")))
-    assert alone.new_episodes == "of 2 processes"
+    assert alone.new_episodes == "the checkpoint is of 2 processes, this run has 1"
     assert alone.env_steps == one["steps"] and alone.env.env.levels.goals == pytest.approx(0.02)
     networks = (alone.alg.actor, alone.alg.critic)
     weights = torch.cat(
