@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vd.kernels.task.shapes import EXTENT_CENTRE_M, SHAPE_UNIT_M
 from vd.vision.cfg import StudentCfg
 from vd.vision.inputs import Belief, StudentInput, carried
 from vd.vision.rotations import first_columns, matrices
@@ -41,10 +42,6 @@ LOG_SCALE = (-3.0, 3.0)
 """Least and largest logarithm of that deviation: from 0.5 mm to 20 cm."""
 LEAST_M = 1e-4
 """Goals are as if they were this wide at least [m], for what cannot be told."""
-NEAR_M = 0.02
-"""Unit of distances to the surface and of how far it extends [m]: fingertips are so far from it."""
-EXTENT_M = 0.05
-"""Subtracted from how far the surface extends [m]: about its mean over objects."""
 DIRECTIONS = tuple(way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way))
 """Directions in which it is told how far the surface extends: to the neighbours of a cell."""
 
@@ -314,10 +311,10 @@ class Student(nn.Module):
         nearest = torch.cdist(tips, laid).argmin(dim=-1, keepdim=True)
         way = laid.gather(-2, nearest.expand_as(tips)) - tips
         told = [sight.proprioception, first_columns(turn), belief.position / PLACE_M]
-        told.append(way.flatten(-2) / NEAR_M)
+        told.append(way.flatten(-2) / SHAPE_UNIT_M)
         for cloud in (laid, wanted):
             extent = (cloud @ self.directions.T).amax(dim=-2)
-            told.append((extent - EXTENT_M) / NEAR_M)
+            told.append((extent - EXTENT_CENTRE_M) / SHAPE_UNIT_M)
         return torch.cat(told, dim=-1)
 
     def _remember(
