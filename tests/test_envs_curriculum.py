@@ -18,6 +18,8 @@ from vd.envs.curriculum import LEVELS, Levels, moving_levels, next_levels
 from vd.envs.effects import PARAMETERS
 from vd.envs.parameters import GOAL_START_RAD, STILLNESS_START
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.conditions import CONDITIONS
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.paper import PAPER
 
 LEVEL = LevelCfg(rate=0.25, raise_at=0.5, lower_at=0.3)
@@ -146,6 +148,27 @@ def test_what_is_drawn_grows_with_the_level_of_physics():
     noise, force = random.action_noise_std, full[-1]
     assert full == pytest.approx([2.0, 0.4, 0.1, 0.1, 0.2, 1.0, noise, force]) and force > 0.0
     assert half == pytest.approx(np.mean([nothing, full], axis=0), rel=1e-5)
+
+
+def test_a_tracker_is_exact_and_at_once_before_the_level_of_physics_rises():
+    random = dataclasses.replace(CONDITIONS["tracked"], table_friction=(0.5, 0.5))
+    env = make(CurriculumCfg(physics=LEVEL), randomisation=random)
+    column = teacher_observation_slices(3, 9)["object_position"]
+
+    def largest_error() -> float:
+        """Of the position that is told in the steps of a fall [m]."""
+        env.reset()
+        errors = []
+        for _ in range(4):
+            env.launch_step()
+            true = env.sim.joint_q.numpy()[:, env.num_actions :][:, :3]
+            errors.append(np.abs(env.observation.numpy()[:, column] - true).max())
+        return max(errors)
+
+    step_m = 1.5 / env.cfg.sim.physics_hz  # what falls from the start is slower than 1.5 m/s
+    assert largest_error() < step_m
+    env.set_levels(Levels())
+    assert largest_error() > 2.0 * step_m
 
 
 def test_tables_leave_and_lifted_objects_get_their_weight_with_the_level_of_air():

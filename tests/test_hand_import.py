@@ -19,19 +19,23 @@ import pytest
 import trimesh
 import warp as wp
 from scipy.spatial.transform import Rotation
+from small_scenes import SmallScene
 
 from vd.assets_usd import cli
 from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, Workspace, compose
 from vd.assets_usd.hand_import import bowl
 from vd.assets_usd.hand_import.bowl import NEAR, Drops
+from vd.assets_usd.hand_import.description import read_description
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
-from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.bundle import read_policy
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import SHAPE_OBJECT, build_hand, new_builder
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
@@ -413,6 +417,31 @@ def test_a_tendons_servo_is_as_stiff_and_strong_as_it_turns_its_joints(
     assert hand.effort[0] == pytest.approx(abs(torque(100.0, 0.0)), rel=1e-4)
 
 
+@pytest.mark.parametrize("load", [0.0, -0.2, -0.5, -0.7])
+def test_a_simulated_drive_carries_what_is_on_its_follower(tmp_path, load):
+    """By virtual work: a torque on b4 is 0.8 of it on b3, whose drive has 2 N m/rad and 0.5 N m."""
+    (tmp_path / "said.yaml").write_text("drive: {kp: 2.0, kd: 0.1, effort: 0.5}")
+    hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
+    world = build_hand(hand, SimCfg(), visuals=False)
+    world.gravity = (0.0, 0.0, 0.0)
+    builder = new_builder()
+    builder.add_world(world)
+    scene = SmallScene(builder, SimCfg(), "cpu")
+    target = hand.start + np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
+    scene.control.joint_target_q.assign(target.astype(np.float32))
+    scene.control.joint_f.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, load], dtype=np.float32))
+    scene.run(3.0)
+    q = scene.state.joint_q.numpy()
+    give = abs(load) / (
+        10 * 2.0
+    )  # the solver's coupling is ten times as stiff as the drive, or more
+    np.testing.assert_allclose(q[5], 0.8 * q[4] + 0.05, atol=give + 1e-5)
+    if 0.8 * abs(load) < 0.5:
+        assert q[4] - target[4] == pytest.approx(0.8 * load / 2.0, abs=1e-3)
+    else:
+        assert q[4] < hand.lower[4] + 0.01, "stronger than the drive"
+
+
 def test_a_guessed_drive_has_the_damping_that_its_joint_needs(tmp_path):
     """The file's damping is the joint's own; MuJoCo's mass matrix says what is critical."""
     damped = replaced('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><dynamics damping="0.0002"/>')
@@ -649,6 +678,17 @@ def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_
         assert not done.warnings
 
 
+def test_the_left_leap_hand_is_described_as_the_mirror_image_of_the_right_one():
+    right = read_description("leap")
+    left = read_description("leap_left")
+    assert left.motors == right.motors and left.drive == right.drive
+    assert {name: abs(angle) for name, angle in left.start.items()} == right.start
+    assert {name for name, angle in left.start.items() if angle < 0.0} == {"12", "13"}
+    for field in ("drop", "goal"):
+        place = getattr(right.workspace, field)
+        assert getattr(left.workspace, field) == (place[0], -place[1], place[2])
+
+
 @pytest.mark.parametrize("colliders", [1, 6])
 def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
     """Of many colliders, as LEAP has, MuJoCo's masks hold who meets whom by the groups of fingers alone."""
@@ -695,7 +735,7 @@ def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
         ReorientEnv(replace(cfg, table=TableCfg(away_share=0.5)), "cpu")
 
 
-def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
+def test_a_hand_of_five_motors_trains_with_objects_of_all_its_sizes(tmp_path):
     (tmp_path / "said.yaml").write_text("workspace: {size: [0.04, 0.05]}")
     hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
     small = [
@@ -708,7 +748,7 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
         "--device",
         "cpu",
     ]
-    flags = ["--preset", "leap-objects", "--objects", "cube", "--hand", str(hand.path), *small]
+    flags = ["--preset", "leap-cube", "--hand", str(hand.path), *small]
     assert train(["teacher", *flags, "--out", str(tmp_path / "run")]) == 0
     rows = [
         json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()
@@ -717,7 +757,14 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
     policy = read_policy(tmp_path / "run" / "policy.safetensors")
     assert policy.num_actions == 5
     env = ReorientEnv(ReorientCfg.of(policy), "cpu")
-    assert env.objects[0].longest_side == pytest.approx(0.05)
-    np.testing.assert_allclose(np.ptp(env.objects[0].hulls[0].vertices, axis=0), 0.05, rtol=1e-6)
+    model = env.scene.model
+    cubes = np.flatnonzero(env.scene.shape_kind == SHAPE_OBJECT)
+    sides = [np.ptp(model.shape_source[i].vertices, axis=0) for i in cubes]
+    np.testing.assert_allclose(np.unique(np.round(sides, 5)), np.linspace(0.04, 0.05, 5))
+    plain = ReorientEnv(
+        ReorientCfg.of(policy, randomisation=RandomisationCfg(enabled=False)), "cpu"
+    )
+    assert plain.objects[0].longest_side == pytest.approx(0.05), "as little as fits"
+    assert (plain.scene.world_scale == 1.0).all()
     env.step(wp.from_torch(policy.act(wp.to_torch(env.observation))))
     assert np.isfinite(env.observation.numpy()).all()

@@ -38,9 +38,9 @@ _RARE = {
     "env.observation": "terms critic_terms",
     "env.curriculum": "goals stillness physics air loose",
     "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction "
-    "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "
-    "observation_noise_mean observation_noise_std observation_offset_std force_probability "
-    "force_n_per_kg force_decay tracked_pose",
+    "object_scale object_scale_count object_sizes object_mass_kg action_noise_std "
+    "action_offset_std observation_noise_mean observation_noise_std observation_offset_std "
+    "force_probability force_n_per_kg force_decay tracked_pose",
 }
 OF_HELP_ALL = frozenset(
     f"{group}.{name}" for group, names in _RARE.items() for name in names.split()

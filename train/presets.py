@@ -165,6 +165,8 @@ def gpu() -> TeacherCfg:
 def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> TeacherCfg:
     """An imported hand, palm up: objects rest in it, goal after goal in any orientation.
 
+    Nothing is drawn.
+
     Args:
         preset: Its name.
         hand: Name by which ``vd-assets hand import`` keeps the hand.
@@ -200,6 +202,21 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
         ppo=replace(base.ppo, desired_kl=0.06, late_kl=None),  # with which they were trained
         env=env,
     )
+
+
+def cube_in_palm(preset: str, hand: str) -> TeacherCfg:
+    """A cube of every size that the hand's USD promises, in mixed, told by a tracker outside.
+
+    Arguments as of :func:`in_palm`.
+    """
+    base = in_palm(preset, hand)
+    env = replace(
+        base.env,
+        # The critic knows the present and what is drawn.
+        observation=replace(base.env.observation, dynamics="critic"),
+        randomisation=replace(CONDITIONS["mixed-tracked"], redraw_s=10.0, object_sizes=5),
+    )
+    return replace(base, env=env)
 
 
 def spin(preset: str, hand: str) -> TeacherCfg:
@@ -284,10 +301,10 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "paper": paper,
     "cpu-demo": cpu_demo,
     "gpu": gpu,
-    "leap-cube": partial(in_palm, "leap-cube", "leap"),
+    "leap-cube": partial(cube_in_palm, "leap-cube", "leap"),
     "leap-objects": partial(in_palm, "leap-objects", "leap", TRAINING_SET),
     "leap-spin": partial(spin, "leap-spin", "leap"),
-    "allegro-cube": partial(in_palm, "allegro-cube", "allegro"),
+    "allegro-cube": partial(cube_in_palm, "allegro-cube", "allegro"),
     "allegro-spin": partial(spin, "allegro-spin", "allegro"),
 }
 """Presets by name."""
@@ -325,6 +342,11 @@ def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
             logger="none",
         ),
         ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
-        # Finding poses takes long.
-        env=replace(cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)),
+        env=replace(
+            cfg.env,
+            objects=("cube",),  # a set of many needs as many environments
+            num_envs=16,
+            # Finding poses takes long.
+            start=replace(cfg.env.start, poses=1),
+        ),
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 from vd.assets_usd.hand_data import HandError, MotorModel
 from vd.command.config import from_dict
 
-BUILT_IN = ("leap", "allegro")
+BUILT_IN = ("leap", "leap_left", "allegro")
 """Hands whose description comes with the package."""
 
 

@@ -164,7 +164,7 @@ def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
 def _unnamed(source: Source, describe: str | Path | None) -> list[str]:
     """What is said of a hand that comes without the description which the package has of it."""
     name = source.name.removesuffix("_right")
-    if describe is not None or name not in BUILT_IN or name == source.name:
+    if describe is not None or name not in BUILT_IN:
         return []
     return [
         f"policies and presets know this hand as {name}, with what its file does not say: import "

@@ -65,8 +65,11 @@ def dynamics_kernel(
             delay = servo_in[row, COMMAND_DELAY]
             friction = servo_in[row, COULOMB_TORQUE]
             play = servo_in[row, BACKLASH_WIDTH]
-        kp = kp_in[world, joint] / nominal_kp[joint]
-        kd = kd_in[world, joint] / nominal_kd[joint]
+        kp = wp.float32(1.0)
+        kd = wp.float32(1.0)
+        if nominal_kp[joint] > 0.0:  # a joint that follows another has no drive
+            kp = kp_in[world, joint] / nominal_kp[joint]
+            kd = kd_in[world, joint] / nominal_kd[joint]
         observation_out[world, out] = (kp - 1.0) / wp.static(GAIN_UNIT)
         observation_out[world, out + joints] = (kd - 1.0) / wp.static(GAIN_UNIT)
         observation_out[world, out + 2 * joints] = delay / wp.static(DELAY_UNIT_S)

@@ -379,6 +379,9 @@ class RandomisationCfg:
     """Object sizes are this many even steps of ``object_scale``: every size is a set of compiled
     meshes.
     """
+    object_sizes: int = 0
+    """Ours: so many sizes, even steps over those in the hand's USD, in place of ``object_scale``;
+    0: none."""
     object_mass_kg: tuple[float, float] = PAPER.randomisation.object_mass_kg
     """Masses of the object [kg]."""
     object_com_m: float = 0.0
@@ -453,6 +456,7 @@ class RandomisationCfg:
                 f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to "
                 f"be in [0, {MAX_LATENCY_S:g}]"
             )
+        require(self, "randomisation.", "zero or positive", "object_sizes")
         self.tracked_pose.validate()
         late = self.observation_latency_s[1] + self.observation_jitter_s
         if self.tracked_pose.enabled and late > 0.0:

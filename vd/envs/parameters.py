@@ -15,6 +15,7 @@ from vd.kernels.task.randomisation import ForceParams, RandomisationParams
 from vd.kernels.task.resets import GoalParams, StartParams
 from vd.kernels.task.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams
 from vd.kernels.task.success import SuccessParams
+from vd.kernels.task.tracked_pose import TrackedPoseParams
 from vd.paper import PAPER
 
 STILLNESS_START = 12.0
@@ -37,6 +38,7 @@ _STRUCTS: dict[str, Any] = {
     "reward": RewardParams,
     "success": SuccessParams,
     "goal": GoalParams,
+    "tracked_pose": TrackedPoseParams,
 }
 
 
@@ -46,8 +48,8 @@ class TaskParameters:
     Arrays because a CUDA graph bakes scalar arguments in; a curriculum writes into them instead.
 
     Attributes:
-        action, observation, exact_observation, start, force, randomisation, reward, success, goal:
-            The structs; ``exact_observation`` is without noise.
+        action, observation, exact_observation, start, force, randomisation, reward, success, goal,
+            tracked_pose: The structs; ``exact_observation`` is without noise.
         weight: Share of its weight that an object which has to be lifted has, shape [1].
         must_lift: 1 where success asks that the object does not touch the table, int32, shape [N].
         table_steps: Control steps of an episode for which the table stays, int32, shape [N].
@@ -62,6 +64,7 @@ class TaskParameters:
     reward: wp.array
     success: wp.array
     goal: wp.array
+    tracked_pose: wp.array
 
     def __init__(self, cfg: ReorientCfg, hand: HandModel, device: Any):
         """Put the configuration at full difficulty on ``device``."""
@@ -193,6 +196,17 @@ class TaskParameters:
             link_mass_scale=random.link_mass_scale if random.enabled else (1.0, 1.0),
             action_offset_std=share * random.action_offset_std,
             observation_offset_std=share * random.observation_offset_std,
+        )
+        tracker = random.tracked_pose
+        # At level 0 a pose comes with every physics step, at once and true.
+        self._write(
+            "tracked_pose",
+            rate_hz=_between((cfg.sim.physics_hz,) * 2, tracker.rate_hz, share),
+            age_s=_between(0.0, tracker.age_s, share),
+            dropped=share * tracker.dropped,
+            jumping=share * tracker.jumping,
+            jump=tracker.jump,
+            noise=_between(0.0, tracker.noise, share),
         )
         for array, nominal, drawn in self._blended:
             array.assign(_between(nominal, drawn, level).astype(np.float32))

@@ -11,11 +11,22 @@ ALWAYS = 2**31 - 1
 """Last step of a table that stays."""
 
 
-def object_scales(random: RandomisationCfg) -> list[float]:
-    """Size factors of the objects; 1 alone where nothing is randomised."""
+def object_scales(
+    random: RandomisationCfg, longest_side_m: float, hand_sizes_m: tuple[float, float]
+) -> list[float]:
+    """Size factors of an object; 1 alone where nothing is randomised.
+
+    Args:
+        random: What is drawn.
+        longest_side_m: Of the object [m].
+        hand_sizes_m: Smallest and largest longest side of the hand's objects [m].
+    """
     if not random.enabled:
         return [1.0]
-    return list(map(float, np.linspace(*random.object_scale, random.object_scale_count)))
+    if random.object_sizes:
+        sizes = np.linspace(*hand_sizes_m, random.object_sizes)
+        return (sizes / longest_side_m).tolist()
+    return np.linspace(*random.object_scale, random.object_scale_count).tolist()
 
 
 def table_steps(cfg: ReorientCfg, air: float) -> np.ndarray:

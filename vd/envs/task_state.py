@@ -114,13 +114,15 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         )
     if cfg.fit_objects:
         objects = [item.fitted(hand.workspace.size_m) for item in objects]
+    sizes = hand.workspace.size_m
+    scales = [object_scales(cfg.randomisation, item.longest_side, sizes) for item in objects]
     scene = build_scene(
         hand=hand,
         objects=objects,
         num_envs=cfg.num_envs,
         cfg=cfg.sim,
         device=device,
-        scales=object_scales(cfg.randomisation),
+        scales=scales,
         visuals=cfg.visuals,
     )
     ranges = servo_ranges(hand, cfg.randomisation)

@@ -8,7 +8,6 @@ import warp as wp
 from vd.envs.latency import SeenState
 from vd.envs.task_state import TaskState
 from vd.kernels.task.tracked_pose import (
-    TrackedPoseParams,
     begin_tracked_pose_kernel,
     hold_pose_kernel,
     take_pose_kernel,
@@ -27,18 +26,10 @@ class TrackedPose:
         self._state = state
         self._seen = seen
         random = state.cfg.randomisation
-        cfg = random.tracked_pose
-        self.is_tracked = random.enabled and cfg.enabled
+        self.is_tracked = random.enabled and random.tracked_pose.enabled
         if not self.is_tracked:
             return
-        params = TrackedPoseParams()
-        params.rate_hz = wp.vec2(*cfg.rate_hz)
-        params.age_s = wp.vec2(*cfg.age_s)
-        params.dropped = cfg.dropped
-        params.jumping = cfg.jumping
-        params.jump = wp.vec2(*cfg.jump)
-        params.noise = wp.vec2(*cfg.noise)
-        self._params = wp.array([params], dtype=TrackedPoseParams, device=state.device)
+        self._params = state.parameters.tracked_pose
         n = state.num_envs
         zeros = state.zeros
         self._rate = zeros(n, saved="tracked_rate")

@@ -163,7 +163,8 @@ class EvalCfg(HandFlags, EpisodeFlags):
     """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same
     with forces that last a control step; mixed, Table S3 with friction, backlash, late commands and
     a late object; observation-late (the object), all-late (joints too) and command-late, 83 ms and
-    nothing else; the others change one thing, which the page of --suite robust names."""
+    nothing else; sizes, all of the hand's file; the others change one thing, which the page of
+    --suite robust names."""
     plan: tyro.conf.FlagCreatePairsOff[bool] = False
     """Plan every step by sampling 256 futures of a second, with the nominal simulator as model. A
     teacher proposes half of them; ``zero --plan`` needs none. It tells what physics allows: GPUs.

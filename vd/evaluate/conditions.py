@@ -117,6 +117,10 @@ _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
         _only(friction=_at(_FRICTION[0])),
     ),
     "grippy": (f"friction of hand and object {_FRICTION[1]:g}", _only(friction=_at(_FRICTION[1]))),
+    "sizes": (
+        "objects of five sizes, from the smallest to the largest of the hand's file",
+        _only(object_sizes=5),
+    ),
     "off-centre": (f"centre of mass {OFF_CENTRE_M:g} m off", _only(object_com_m=OFF_CENTRE_M)),
     "soft-tips": ("soft fingertips", _only(enabled=False)),
     "stiff-contacts": ("contacts twice as stiff, physics steps half as long", _only(enabled=False)),

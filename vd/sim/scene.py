@@ -296,7 +296,7 @@ def build_scene(
     num_envs: int,
     cfg: SimCfg,
     device: str,
-    scales: Sequence[float] = (1.0,),
+    scales: Sequence[Sequence[float]] | None = None,
     visuals: bool = False,
 ) -> Scene:
     """Build and finalize ``num_envs`` worlds.
@@ -307,7 +307,7 @@ def build_scene(
         num_envs: N.
         cfg: Physics settings.
         device: Warp device.
-        scales: Size factors, spread evenly over the worlds of each object.
+        scales: Size factors of each object, spread evenly over its worlds; None: 1.
         visuals: Include visual shapes.
 
     Raises:
@@ -327,10 +327,11 @@ def build_scene(
     worlds = []
     for index, item in enumerate(items):
         count = int(np.count_nonzero(world_object == index))
-        scale_index = assign_objects(count, len(scales))
-        world_scale[world_object == index] = np.asarray(scales)[scale_index]
-        per_scale = np.bincount(scale_index, minlength=len(scales))
-        for scale, copies in zip(scales, per_scale, strict=False):
+        sizes = (1.0,) if scales is None else scales[index]
+        scale_index = assign_objects(count, len(sizes))
+        world_scale[world_object == index] = np.asarray(sizes)[scale_index]
+        per_scale = np.bincount(scale_index, minlength=len(sizes))
+        for scale, copies in zip(sizes, per_scale, strict=False):
             if copies == 0:
                 continue
             world = new_builder()
