@@ -31,11 +31,13 @@ from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.sets import load_set
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.bundle import read_policy
 from vd.sim.cfg import SimCfg
-from vd.sim.scene import SHAPE_OBJECT, build_hand, new_builder
+from vd.sim.scene import SHAPE_OBJECT, build_hand, build_scene, new_builder
+from vd.sim.simulator import Simulator
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
@@ -440,6 +442,24 @@ def test_a_simulated_drive_carries_what_is_on_its_follower(tmp_path, load):
         assert q[4] - target[4] == pytest.approx(0.8 * load / 2.0, abs=1e-3)
     else:
         assert q[4] < hand.lower[4] + 0.01, "stronger than the drive"
+
+
+def test_servos_of_a_hand_with_followers_move_it_as_plain_drives_do(tmp_path):
+    (tmp_path / "said.yaml").write_text("mimic: {a2: {joint: a1}}")
+    hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
+    cfg = replace(SimCfg(), control_hz=60.0)
+    scene = build_scene(hand=hand, objects=load_set("cube")[:1], num_envs=2, cfg=cfg, device="cpu")
+    ends = []
+    for rows in (None, hand.servo):
+        sim = Simulator(scene, cfg, servo_rows=rows)
+        wanted = np.zeros(sim.target.shape, dtype=np.float32)
+        wanted[:, hand.actuated] = [[0.3, 0.2, 0.4, 0.3], [0.1, 0.5, 0.1, 0.6]]
+        sim.target.assign(wanted)
+        for _ in range(40):
+            sim.step()
+        ends.append(sim.joint_q.numpy()[:, : hand.num_joints])
+        np.testing.assert_allclose(ends[-1][:, hand.actuated], wanted[:, hand.actuated], atol=0.05)
+    np.testing.assert_allclose(*ends, atol=0.005)
 
 
 def test_a_guessed_drive_has_the_damping_that_its_joint_needs(tmp_path):

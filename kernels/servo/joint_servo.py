@@ -170,6 +170,7 @@ def drive_joint_kernel(
     first: wp.array[int],  # [D] first joint of each joint's finger
     inverse_inertia: wp.array2d[float],  # [N, *] diagonal of the inverse inertia [1/(kg m^2)]
     effort: wp.array2d[float],  # [N, *] largest torques of the drives [N m], which the solver keeps
+    actuator: wp.array[int],  # [D] each joint's of the A actuators; -1 where it follows another joint
     # In:
     dt: float,  # physics time step [s]
     reference_in: wp.array2d[float],  # [N, D] mean reference of this step [rad]
@@ -181,8 +182,8 @@ def drive_joint_kernel(
     # Out:
     reference_out: wp.array2d[float],  # [N, *] position to which the drive pulls [rad]
     joint_force_out: wp.array2d[float],  # [N, *] torque besides the drive's [N m]
-    gain_out: wp.array2d[vec10],  # [N, D] MuJoCo's gain parameters of the actuators; (kp, ..)
-    bias_out: wp.array2d[vec10],  # [N, D] MuJoCo's bias parameters; (0, -kp, -kd, ..)
+    gain_out: wp.array2d[vec10],  # [N, A] MuJoCo's gain parameters of the actuators; (kp, ..)
+    bias_out: wp.array2d[vec10],  # [N, A] MuJoCo's bias parameters; (0, -kp, -kd, ..)
     friction_out: wp.array2d[float],  # [N, *] MuJoCo's friction loss of the joints [N m]
     friction_solref_out: wp.array2d[wp.vec2],  # [N, *] its solref, (stiffness, damping) negated
     friction_solimp_out: wp.array2d[vec5],  # [N, *] its solimp
@@ -225,9 +226,11 @@ def drive_joint_kernel(
         torque -= explicit
     reference_out[world, joint] = reference
     joint_force_out[world, joint] = torque
-    gain_out[world, joint][0] = drive.stiffness
-    bias_out[world, joint][1] = -drive.stiffness
-    bias_out[world, joint][2] = -damping
+    column = actuator[joint]
+    if column >= 0:
+        gain_out[world, column][0] = drive.stiffness
+        bias_out[world, column][1] = -drive.stiffness
+        bias_out[world, column][2] = -damping
     # The load of load friction is what the drive can give, not what the controller wants of it.
     beyond = wp.max(drive.motor - effort[world, joint], 0.0)
     friction_out[world, joint] = wp.max(

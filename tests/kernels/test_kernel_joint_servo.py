@@ -9,10 +9,12 @@ from kernel_oracle import EXAMPLES, device_array, floats, launch, streams, unwri
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.effects import neutral_row
 from vd.kernels.servo.joint_servo import (
+    drive_joint_kernel,
     finish_joint_kernel,
     measure_joint_kernel,
     receive_command_kernel,
     send_command_kernel,
+    vec10,
 )
 
 DT = 1.0 / 120.0
@@ -125,3 +127,31 @@ def test_what_is_measured_is_old_limited_and_biased(device, positions, delay, bi
         when = np.arange(-len(past) + 1, 1) * DT
         assert np.allclose(measured, np.interp(-delay, when, past) + bias, atol=1e-3)
         assert np.allclose(measured_speed, np.interp(-delay, when, past_speed), atol=1e-2)
+
+
+@EXAMPLES
+@given(kp=floats((2, 3), 0.5, 5.0), kd=floats((2, 3), 0.0, 0.5))
+def test_gains_reach_the_actuators_of_their_joints_and_nothing_beyond(device, kp, kd):
+    """Of three joints the second follows another one, and has none; a third world is not there."""
+    worlds, joints = kp.shape
+    rows = parameter_rows(worlds * joints, KP=kp.ravel(), KD=kd.ravel())
+    nothing = np.zeros((worlds, joints))
+    everything = np.ones((worlds, joints))
+    model = [rows, [0, 0, 0], everything, everything, [0, -1, 1]]
+    motion = [DT, nothing, everything, nothing, nothing]
+    state = np.zeros((worlds * joints, servo.STATE_COLUMNS))
+    gain, bias = (unwritten((worlds + 1, 2), vec10, device) for _ in range(2))
+    outputs = [nothing, nothing, gain[:worlds], bias[:worlds]]
+    launch(
+        drive_joint_kernel,
+        (worlds, joints),
+        [*model, *motion, state, *outputs],
+        device,
+        *[(worlds, joints)] * 3,
+    )
+    expected = np.full((2, worlds + 1, 2, 10), np.nan)
+    expected[0, :worlds, :, 0] = kp[:, [0, 2]]
+    expected[1, :worlds, :, 1] = -kp[:, [0, 2]]
+    # Half of a damping that is small for the step is implicit, which is of second order.
+    expected[1, :worlds, :, 2] = -0.5 * kd[:, [0, 2]]
+    np.testing.assert_allclose([gain.numpy(), bias.numpy()], expected, rtol=1e-5, atol=1e-6)

@@ -70,7 +70,7 @@ class JointServo:
 
         Args:
             solver: The solver, whose model this class writes drives and friction of the hand into.
-                The hand's joints are the first of each world, with a position drive each.
+                The hand's joints are the first of each world, with a position drive each or none.
             control: The control of the simulation; its joint targets become the drives' references
                 and its joint forces the torques besides the drives'.
             joint_q: Positions, hand joints first, shape [N, *]; read at every reset.
@@ -105,6 +105,10 @@ class JointServo:
         )
         self.first = wp.array(first, dtype=int, device=self.device)
         """First joint of each joint's finger [D]."""
+        driven = solver.mjc_actuator_to_newton_idx.numpy()
+        actuator = np.full(d, -1)
+        actuator[driven] = np.arange(len(driven))
+        self._actuator = wp.array(actuator, dtype=int, device=self.device)
         self._dim = n, d
         self.power = wp.ones((n, d), dtype=float, device=self.device)
         """Factor on the controllers' gains; 0 switches the torque off, shape [N, D]."""
@@ -206,9 +210,9 @@ class JointServo:
 
         Positions [rad] and velocities [rad/s] are those at the start of the step, shape [N, *].
         """
-        model = [self.parameters, self.first, self._inverse_inertia, self._effort]
+        joints = [self.parameters, self.first, self._inverse_inertia, self._effort, self._actuator]
         inputs = [self.dt, self.reference, self.power, joint_q, joint_qd]
-        launch(drive_joint_kernel, self._dim, [*model, *inputs], [self.state, *self._outputs])
+        launch(drive_joint_kernel, self._dim, [*joints, *inputs], [self.state, *self._outputs])
 
     def finish(self, previous_q: wp.array2d, joint_q: wp.array2d, joint_qd: wp.array2d) -> None:
         """Apply the velocity limits to the state after a physics step, and remember it.
