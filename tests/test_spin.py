@@ -18,7 +18,7 @@ from vd.envs.cfg import ObservationCfg, RewardCfg, SpinCfg, StartCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli as evaluate
 from vd.evaluate import compare
-from vd.evaluate.spin import SPIN_FILE, turn
+from vd.evaluate.spin import SPIN_FILE, SpinResult, Turns, turn
 from vd.logs.hand_log import read_log
 from vd.policy.agents import open_policy, task_for
 from vd.train import cli as train
@@ -130,6 +130,11 @@ def test_it_is_judged_by_its_turns_and_is_no_policy_with_goals(
         assert why in capsys.readouterr().err
     assert train.main(["tracker", policy, "--objects", "cube", "--device", "cpu"]) == 1
     assert f"{policy} turns objects" in capsys.readouterr().err
+
+
+def test_what_hardly_turned_backwards_turned_nothing():
+    row = Turns("zero", "cube", 2, -1e-4, 0.0, -1e-4, 0.5, 1.0)
+    assert "-" not in SpinResult((row,), (0.0, 0.0, 1.0), 30.0, "off", 0).text()
 
 
 def test_revolutions_are_about_the_axis_however_often_it_goes_round():

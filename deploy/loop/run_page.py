@@ -45,7 +45,7 @@ class GoalResult:
     def __str__(self) -> str:
         """In one line."""
         if self.turned is not None:
-            return f"turned {self.turned:.2f} times: {self.outcome} after {self.seconds:.1f} s"
+            return f"turned {self.turned:z.2f} times: {self.outcome} after {self.seconds:.1f} s"
         words = {True: "reached", False: "not reached", None: "error not known"}[self.success]
         far = "" if self.error_rad is None else f", {self.error_rad:.2f} rad from it"
         predicted = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
@@ -96,7 +96,7 @@ def summary_line(results: Sequence[GoalResult], goals: int) -> str:
     """How many goals were reached of those that were to be pursued, or how far what spins turned."""
     turns = [result.turned for result in results if result.turned is not None]
     if turns:
-        return f"{sum(turns):.2f} revolutions"
+        return f"{sum(turns):z.2f} revolutions"
     if any(result.success is None for result in results):
         stopped = sum(result.outcome == "stopped" for result in results)
         return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors"

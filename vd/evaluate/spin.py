@@ -65,8 +65,8 @@ class SpinResult:
         """A table for a terminal."""
         lines = [_HEADER]
         for row in self.rows:
-            per_drop = NOTHING if row.per_drop is None else f"{row.per_drop:.1f}"
-            figures = (f"{row.revolutions:.2f} (sd {row.revolutions_sd:.2f})", per_drop)
+            per_drop = NOTHING if row.per_drop is None else f"{row.per_drop:z.1f}"
+            figures = (f"{row.revolutions:z.2f} (sd {row.revolutions_sd:.2f})", per_drop)
             held = (f"{100 * row.dropped:.0f} %", f"{row.held_s:.1f}")
             lines.append((row.policy, row.object, *figures, *held))
         axis = " ".join(f"{value:g}" for value in self.axis)
