@@ -50,7 +50,8 @@ class HandImport:
     file: tyro.conf.Positional[Path]
     """URDF or MJCF, with its meshes where it says."""
     describe: str | None = None
-    """YAML with what the file does not say, or the name of a built-in one: leap, allegro."""
+    """YAML with what the file does not say, or the name of a built-in one: leap, leap_left,
+    allegro."""
     out: Path | None = None
     """Folder to write to; by default one of the asset cache, named after the hand."""
     bowl: bool = True

@@ -170,7 +170,7 @@ def drive_joint_kernel(
     first: wp.array[int],  # [D] first joint of each joint's finger
     inverse_inertia: wp.array2d[float],  # [N, *] diagonal of the inverse inertia [1/(kg m^2)]
     effort: wp.array2d[float],  # [N, *] largest torques of the drives [N m], which the solver keeps
-    actuator: wp.array[int],  # [D] each joint's of the A actuators; -1 where it follows another joint
+    actuator: wp.array[int],  # [D] each joint's of A actuators; -1 where it follows another
     # In:
     dt: float,  # physics time step [s]
     reference_in: wp.array2d[float],  # [N, D] mean reference of this step [rad]
