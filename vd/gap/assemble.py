@@ -82,7 +82,10 @@ def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -
     total = sum(len(t.time) for t in recording.trajectories)
     result = np.full((total, len(recording.joints)), np.nan)
     for index, chain in enumerate(problems.chains):
-        own = {spec.joint: rows[spec.joint] for spec, rows in models if spec.chain == index}
+        own = {}
+        for spec, rows in models:
+            if spec.chain == index:
+                own[spec.joint] = rows[spec.joint]
         if own:
             rows = np.array([own.get(joint, row) for joint, row in enumerate(chain.start_row)])
             rollouts = Rollouts(
@@ -201,7 +204,10 @@ def _baseline_values(spec: JointSpec, fit: JointFit) -> dict[str, float]:
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and row[GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)
-    return {name: float(row[PARAMETERS[name].column]) for name in names}
+    result = {}
+    for name in names:
+        result[name] = float(row[PARAMETERS[name].column])
+    return result
 
 
 def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -346,7 +352,9 @@ def _models(joint: AnalysedJoint) -> list[WholeModel]:
 
 def _credits(joint: AnalysedJoint) -> list[Credit]:
     """What each effect of a joint's delivered model brings, where the model without it was fitted."""
-    by_effects = {frozenset(fit.effects): fit for fit in joint.fits}
+    by_effects = {}
+    for fit in joint.fits:
+        by_effects[frozenset(fit.effects)] = fit
     rows = []
     for name in joint.final.effects:
         without = by_effects.get(frozenset(joint.final.effects) - {name})

@@ -180,7 +180,10 @@ def _finger(
 
     What an unrecorded joint carries is fixed to its parent.
     """
-    slots = [i for i, name in enumerate(hand.joint_names[finger]) if name in names]
+    slots = []
+    for i, name in enumerate(hand.joint_names[finger]):
+        if name in names:
+            slots.append(i)
     joints = finger.start + np.array(slots)
     n = len(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
@@ -252,4 +255,8 @@ def relative_torques(recording: Recording) -> bool:
 
 def others_in(chain: Chain, joint: int) -> list[int]:
     """Slots of the other joints of a chain, whose motion can drive a joint."""
-    return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
+    result = []
+    for j, slot in enumerate(chain.slot):
+        if j != joint:
+            result.append(int(slot))
+    return result

@@ -90,7 +90,9 @@ def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
     for joint, finger, motor in zip(hand.joint_names, hand.joint_finger, hand.motors, strict=True):
         kind = None if motor is None else replace(motor, id=0, sign=1.0, offset_rad=0.0)
         like[joint] = joint.partition("_")[2], np.count_nonzero(hand.joint_finger == finger), kind
-    place = {like[joint]: joint for joint in reversed(known)}
+    place = {}
+    for joint in reversed(known):
+        place[like[joint]] = joint
     others = {}
     for joint in hand.joint_names:
         if joint not in known and like[joint] in place:
@@ -108,7 +110,9 @@ def _effects(
     values: dict[str, dict[str, Any]] = {}
     if joint in start:
         for named in EFFECTS.values():
-            row = {p.name: float(start[joint][p.column]) for p in named.parameters}
+            row = {}
+            for p in named.parameters:
+                row[p.name] = float(start[joint][p.column])
             if any(row[p.name] != p.neutral for p in named.parameters):
                 values[named.name] = row
     if GRAVITY.name in fitted:
@@ -158,12 +162,16 @@ def simulate_again(
         files = [row.file for row in report.trajectories if row.joint == joint]
         fitted[joint] = _squares(curves, joint, files)
     before, after = _rms([*fitted.values()])
-    per_joint = {joint: _rms([squares]) for joint, squares in fitted.items()}
+    per_joint = {}
+    for joint, squares in fitted.items():
+        per_joint[joint] = _rms([squares])
     simulator: Literal["newton", "rollout"] = "rollout" if hand_name is None else "newton"
     closing = Closing(simulator, layer.name, before, after, per_joint)
     delivered = None
     if report.aside:
-        unseen = [_squares(curves, joint, [file]) for joint, file in report.aside.items()]
+        unseen = []
+        for joint, file in report.aside.items():
+            unseen.append(_squares(curves, joint, [file]))
         before, after = _rms(unseen)
         delivered = Delivered(", ".join(dict.fromkeys(report.aside.values())), after, before)
     return closing, delivered, curves

@@ -170,7 +170,9 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
 
 def verdict(found: Sequence[ContactEstimate]) -> Literal["effects", "no_gap", "under_excited"]:
     """What the recording says as a whole, in the words of ``vd-gap run``."""
-    told = {each.verdict for each in found}
+    told = set()
+    for each in found:
+        told.add(each.verdict)
     return "effects" if "effect" in told else "no_gap" if "no_gap" in told else "under_excited"
 
 
@@ -279,7 +281,10 @@ def _stretches(mask: np.ndarray) -> Iterator[slice]:
 def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
     """Stretches in which nothing touches the object."""
     found = list(_stretches(_lowest(motion, state.points) > state.table_m + CLEAR_M))
-    return [_released(motion, part) if i == 0 else part for i, part in enumerate(found)]
+    result = []
+    for i, part in enumerate(found):
+        result.append(_released(motion, part) if i == 0 else part)
+    return result
 
 
 def _released(motion: ContactMotion, part: slice) -> slice:

@@ -196,7 +196,9 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         scales: Sizes of the joint's motion.
     """
     if effect == "joint_coupling":
-        blank = {f"{effect}.from_{slot + 1}": 0.0 for slot in others}
+        blank = {}
+        for slot in others:
+            blank[f"{effect}.from_{slot + 1}"] = 0.0
         return [{**blank, key: factor} for key in blank for factor in (0.05, -0.05)]
     period = EFFECTS["command_delay"].parameters[0].typical
     units = {

@@ -137,7 +137,10 @@ def mjcf(joints: list[JointModel]) -> str:
     spec.option.timestep = STEP_S
     spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
     for joint in joints:
-        values = {term: joint.take(term)[0] for term in TERMS if term != "velocity_limit_sim"}
+        values = {}
+        for term in TERMS:
+            if term != "velocity_limit_sim":
+                values[term] = joint.take(term)[0]
         # A point mass that has both the weight and the inertia.
         pull = values["weight"] / GRAVITY_M_S2
         mass = pull**2 / max(values["armature"], 1e-9) + 1e-9
@@ -200,7 +203,9 @@ def into_hand(layer: Path, joints: list[JointModel], hand: str, path: Path) -> N
         if effect and effect not in RIG:
             effects.setdefault(effect, {})[name] = known[np.isfinite(known)].tolist()
     model = load_hand(hand)
-    drive = {key: float(numbers[key][0]) for key in ("kp", "kd", "velocity_limit")}
+    drive = {}
+    for key in ("kp", "kd", "velocity_limit"):
+        drive[key] = float(numbers[key][0])
     baseline = dict.fromkeys(model.joint_names, drive)
     everywhere = dict.fromkeys(model.joint_names, effects)
     tool = "vd-gap export"

@@ -93,11 +93,15 @@ def _joint(
     floor: float,
 ) -> list[Misfit]:
     """Findings of a joint from its trajectories and what the model leaves of each [T] [rad]."""
-    speeds = [speed_of(t.time, t.position[:, column]) for t, _ in pairs]
+    speeds = []
+    for t, _ in pairs:
+        speeds.append(speed_of(t.time, t.position[:, column]))
     residual = np.concatenate([left for _, left in pairs])
     speed = np.concatenate(speeds)
     top = float(np.percentile(np.abs(speed), 99.5)) + 1e-9
-    masks = [phases(t, column, resolution, top) for t, _ in pairs]
+    masks = []
+    for t, _ in pairs:
+        masks.append(phases(t, column, resolution, top))
     rows = []
     for phase, when in PHASES.items():
         mask = np.concatenate([m[phase] for m in masks])

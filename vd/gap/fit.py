@@ -72,7 +72,10 @@ class JointFit:
     @property
     def values(self) -> dict[str, float]:
         """Parameter values by key."""
-        return {c.key: float(c.value(x)) for c, x in zip(self.coordinates, self.x, strict=True)}
+        result = {}
+        for c, x in zip(self.coordinates, self.x, strict=True):
+            result[c.key] = float(c.value(x))
+        return result
 
     @property
     def rmse(self) -> float:
@@ -232,7 +235,9 @@ class JointProblem:
         """Keys of what a model with these effects fits on this joint."""
         others = others_in(self.rollouts.chain, self.joint)
         slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
-        absent = {f"joint_coupling.from_{slot + 1}" for slot in slots}
+        absent = set()
+        for slot in slots:
+            absent.add(f"joint_coupling.from_{slot + 1}")
         return [*self.baseline, *(key for key in keys_of(effects) if key not in absent)]
 
     def plain(

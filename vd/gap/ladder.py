@@ -164,7 +164,10 @@ class Ladder:
             effects, start = starts[index]
             if effects in best or len(best) < additions or {*centre.effects} - effects:
                 best.setdefault(effects, []).append(start)
-        return {effects: values[:STARTS] for effects, values in best.items()}
+        result = {}
+        for effects, values in best.items():
+            result[effects] = values[:STARTS]
+        return result
 
     def beginnings(
         self, centre: JointFit, effects: Effects, added: Sequence[Mapping[str, float]]
@@ -178,7 +181,9 @@ class Ladder:
         starts = [{**values, **start} for start in added]
         stiffness = self.nominal.get("kp", 0.0)
         torque = stiffness / values["kp"] if stiffness and "kp" in values else 1.0
-        nominal = {key: v * torque ** torque_power(key) for key, v in starts[0].items()}
+        nominal = {}
+        for key, v in starts[0].items():
+            nominal[key] = v * torque ** torque_power(key)
         nominal |= self.nominal
         if "velocity_limit" in self.nominal:
             # No slope leads to a speed limit that binds from one that does not.

@@ -301,7 +301,10 @@ class Report:
             if values["format"] != FORMAT:
                 raise ValueError(f"format is {values['format']!r}, not {FORMAT!r}")
             known = _each_number(values, lambda x: math.nan if x is None else x)
-            absent = {name: None for name in _OPTIONAL if values.get(name) is None}
+            absent = {}
+            for name in _OPTIONAL:
+                if values.get(name) is None:
+                    absent[name] = None
             return from_dict(Report, {**known, **absent})
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: no report of this vd-gap ({error}); run it again") from error
@@ -364,19 +367,26 @@ class Predictions:
         """
         try:
             with np.load(path) as data:
-                arrays = {one.name: data[one.name] for one in fields(Predictions)}
+                arrays = {}
+                for one in fields(Predictions):
+                    arrays[one.name] = data[one.name]
         except (KeyError, OSError, ValueError) as error:
             raise ValueError(
                 f"{path}: not curves of vd-gap ({error}); run vd-gap explain again"
             ) from error
-        names = {key: tuple(arrays[key].tolist()) for key in ("joints", "files")}
+        names = {}
+        for key in ("joints", "files"):
+            names[key] = tuple(arrays[key].tolist())
         return Predictions(**{**arrays, **names})
 
 
 def _each_number(value: Any, change: Callable[[float | None], float | None]) -> Any:
     """Nested dictionaries and lists with their numbers changed; None stands for one."""
     if isinstance(value, dict):
-        return {name: _each_number(item, change) for name, item in value.items()}
+        result = {}
+        for name, item in value.items():
+            result[name] = _each_number(item, change)
+        return result
     if isinstance(value, list):
         return [_each_number(item, change) for item in value]
     return change(value) if value is None or isinstance(value, float) else value

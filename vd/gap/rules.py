@@ -543,7 +543,10 @@ def conclude(
         return Conclusion("unknown", text, plain, tuple(good), weights)
     names = tuple(name for name in good[0].effects if all(name in fit.effects for fit in good))
     families = families_of(good, weights, fits)
-    certain = [name for name, certainty in families.items() if certainty == "certain"]
+    certain = []
+    for name, certainty in families.items():
+        if certainty == "certain":
+            certain.append(name)
     if names:
         reason = f"all models that are not worse than the best have {listing(names)}"
     elif certain:
@@ -585,7 +588,9 @@ def recovered(evidence: Evidence, plain: JointFit, fit: JointFit) -> float:
     pairs = [(plain.rmse, fit.rmse)]
     if not white(evidence, fit):
         pairs.append((plain.held_out_rmse, fit.held_out_rmse))
-    gaps = [(b**2 - a**2) / max(b**2 - evidence.floor**2, 1e-30) for b, a in pairs]
+    gaps = []
+    for b, a in pairs:
+        gaps.append((b**2 - a**2) / max(b**2 - evidence.floor**2, 1e-30))
     return float(min(gaps))
 
 

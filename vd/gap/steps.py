@@ -138,7 +138,10 @@ class Analysis:
         joints = tuple(joint for joint in self.recording.joints if joint in moved)
         if self.hand is not None:
             rows = dict(zip(self.hand.joint_names, self.hand.servo, strict=True))
-            return {joint: rows[joint] for joint in moved.intersection(rows)}
+            result = {}
+            for joint in moved.intersection(rows):
+                result[joint] = rows[joint]
+            return result
         from vd.assets_usd.hand_layer import read_bare_layer
 
         found, _ = read_bare_layer(self.settings.hand_layer, joints)
@@ -182,14 +185,19 @@ class Analysis:
             if name not in seconds:
                 again = f"vd-gap {name} {self.settings.recording} --out {self.out}"
                 raise ValueError(f"{self.out} lacks what comes before; run {again} first")
-        return {name: seconds[name] for name in steps}
+        result = {}
+        for name in steps:
+            result[name] = seconds[name]
+        return result
 
     def _seconds(self) -> dict[str, float]:
         """Seconds of every step that has run on this input, and whose files are there."""
         try:
             record = json.loads((self.out / RUN).read_text())
             same = record["made_from"] == self._made_from
-            there = {path.name for path in self.out.iterdir()}
+            there = set()
+            for path in self.out.iterdir():
+                there.add(path.name)
             ran = record["steps"].items()
             return {name: s for name, s in ran if same and there.issuperset(OUTPUTS[name])}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -228,7 +236,10 @@ class Analysis:
             "--seed": settings.seed,
             "--device": device,
         }
-        said = [f" {flag} {value}" for flag, value in flags.items() if value]
+        said = []
+        for flag, value in flags.items():
+            if value:
+                said.append(f" {flag} {value}")
         return f"vd-gap run {settings.recording} --out {self.out}{''.join(said)}"
 
 

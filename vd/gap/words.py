@@ -225,7 +225,9 @@ def families_sentences(report: Report) -> list[str]:
                 joints.setdefault(row.joint, {}).setdefault(verdict, []).append(row.name)
     sentences = []
     for joint, verdicts in joints.items():
-        parts = [f"{verdict}: {listing(names)}" for verdict, names in verdicts.items()]
+        parts = []
+        for verdict, names in verdicts.items():
+            parts.append(f"{verdict}: {listing(names)}")
         sentences.append(f"{joint}: {'; '.join(parts)}")
     return sentences
 

@@ -86,7 +86,9 @@ def find(
         name = problems.chains[spec.chain].joints[spec.joint]
         floors[name] = spec.floor
         rows[name] = {"rows": fit.rows.tolist()}
-    models = [(spec, fit.rows) for spec, fit in zip(specs, fits, strict=True)]
+    models = []
+    for spec, fit in zip(specs, fits, strict=True):
+        models.append((spec, fit.rows))
     misfits = findings(problems.recording, curves(problems, models), floors)
     value = {
         "format": FIND_FORMAT,
@@ -248,7 +250,10 @@ STAGES = 12
 
 def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
     """Values of a baseline's parameters in a row [PARAMETER_COLUMNS], by key."""
-    return {key: float(row[PARAMETERS[key].column]) for key in keys}
+    result = {}
+    for key in keys:
+        result[key] = float(row[PARAMETERS[key].column])
+    return result
 
 
 def _workers(problems: Problems, options: Options) -> WorkerPool:
@@ -266,7 +271,9 @@ def _problems(
     specs = []
     for index, chain in enumerate(chains(recording, hand)):
         pairs = zip(chain.joints, chain.start_row, strict=True)
-        rows = [options.start.get(name, row) for name, row in pairs]
+        rows = []
+        for name, row in pairs:
+            rows.append(options.start.get(name, row))
         parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
         for joint, column in enumerate(chain.columns):
             trajectories, folds, aside = design(recording, chain, joint)

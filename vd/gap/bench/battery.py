@@ -65,7 +65,10 @@ def battery(
 
     def sized(kind: str, among: Sequence[str]) -> list[Case]:
         each = itertools.product(numbers, sizes, among)
-        return [Case(kind, model, (name,), size, seed, battery=which) for seed, size, name in each]
+        result = []
+        for seed, size, name in each:
+            result.append(Case(kind, model, (name,), size, seed, battery=which))
+        return result
 
     nothing = []
     for number in range(NOTHING_A_SEED * seeds):

@@ -46,7 +46,9 @@ def run_cases(
         The results of all.
     """
     make_folder(folder)
-    done = {case: read_result(folder / f"{case.name}.json") for case in cases}
+    done = {}
+    for case in cases:
+        done[case] = read_result(folder / f"{case.name}.json")
     failed = [case for case in cases if "error" in (done[case] or {})]
     waiting = [*(case for case in cases if done[case] is None), *failed]
     print(

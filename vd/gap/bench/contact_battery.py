@@ -85,7 +85,10 @@ def battery(which: str, seeds: int) -> list[ContactCase]:
     cases *= seeds
     cases += [("pair", pair) for pair in itertools.combinations(CONTACT, 2)] * math.ceil(seeds / 4)
     first = FIRST_SEED[which]
-    return [ContactCase(kind, hidden, first + i) for i, (kind, hidden) in enumerate(cases)]
+    result = []
+    for i, (kind, hidden) in enumerate(cases):
+        result.append(ContactCase(kind, hidden, first + i))
+    return result
 
 
 def run_case(case: ContactCase, folder: Path) -> dict[str, Any]:
@@ -133,7 +136,9 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
     Then what was not named as hidden.
     """
     right: dict[str, list[bool]] = {"single": [], "none": [], "pair": [], "outside": []}
-    clean: dict[str, list[bool]] = {kind: [] for kind in right}
+    clean: dict[str, list[bool]] = {}
+    for kind in right:
+        clean[kind] = []
     first: list[bool] = []
     told: list[bool] = []
     covers: list[bool] = []

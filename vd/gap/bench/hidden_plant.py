@@ -195,9 +195,10 @@ class _Batch:
 
     def _finger(self) -> Finger | None:
         loads = [float(run.conditions.get("payload_kg", 0.0)) for run in self.runs]
-        bodies = [
-            plant.body(kg) for plant, kg in zip(self.plants, loads, strict=True) if plant.body
-        ]
+        bodies = []
+        for plant, kg in zip(self.plants, loads, strict=True):
+            if plant.body:
+                bodies.append(plant.body(kg))
         return Finger(bodies) if bodies else None
 
     def references(self) -> np.ndarray:

@@ -147,7 +147,10 @@ def effect_parameters(name: str) -> dict[str, float]:
         ValueError: There is no such effect.
     """
     if name in EFFECTS:
-        return {parameter.name: parameter.typical for parameter in EFFECTS[name].parameters}
+        result = {}
+        for parameter in EFFECTS[name].parameters:
+            result[parameter.name] = parameter.typical
+        return result
     if name in OUTSIDE:
         return dict(OUTSIDE[name])
     raise ValueError(f"unknown effect {name!r}; choose from {', '.join((*EFFECTS, *OUTSIDE))}")
@@ -284,7 +287,9 @@ class _Session:
         hiding = self.hiding
         effects: dict[str, Any] = {}
         for name, parameters in plant.effects.items():
-            values = {key: _by_joint(plant, value) for key, value in parameters.items()}
+            values = {}
+            for key, value in parameters.items():
+                values[key] = _by_joint(plant, value)
             effects[name] = {"joints": list(plant.joints), "parameters": values}
         return {
             "format": "vd-hidden/1",
@@ -298,7 +303,10 @@ class _Session:
 
 
 def _by_joint(plant: HiddenPlant, values: np.ndarray) -> dict[str, float]:
-    return {joint: float(value) for joint, value in zip(plant.joints, values, strict=True)}
+    result = {}
+    for joint, value in zip(plant.joints, values, strict=True):
+        result[joint] = float(value)
+    return result
 
 
 def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
@@ -309,7 +317,10 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Hidde
         typical = effect_parameters(name)
         signed = []
         if name in EFFECTS:
-            signed = [p.name for p in EFFECTS[name].parameters if p.signed]
+            signed = []
+            for p in EFFECTS[name].parameters:
+                if p.signed:
+                    signed.append(p.name)
         for key, value in given.items():
             if key not in typical:
                 raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")

@@ -266,7 +266,9 @@ class Figure:
 
 def figures(results: Results) -> list[Figure]:
     """The goals' figures over all results, failed cases counted against them."""
-    kinds: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in KINDS}
+    kinds: dict[str, list[Mapping[str, Any]]] = {}
+    for kind in KINDS:
+        kinds[kind] = []
     for r in results:
         kinds[r["case"]["kind"]].append(r)
     single = []
