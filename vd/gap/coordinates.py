@@ -1,7 +1,7 @@
 """Coordinates in which the servo model is fitted, and sizes at which the search for an effect starts."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -167,6 +167,11 @@ def torque_power(key: str) -> int:
 def keys_of(effects: Collection[str]) -> list[str]:
     """Keys of the parameters of effects, in the order of the table."""
     return [key for key in PARAMETERS if key.rpartition(".")[0] in effects]
+
+
+def values_of(row: np.ndarray, keys: Iterable[str]) -> dict[str, float]:
+    """Values of some parameters in a row [PARAMETER_COLUMNS], by key."""
+    return {key: float(row[PARAMETERS[key].column]) for key in keys}
 
 
 def _scale(parameter: Parameter, scales: Scales) -> float:

@@ -160,10 +160,11 @@ def _model_row(row: WholeModel) -> Row:
 
 def _credit_row(report: Report, row: Credit) -> Row:
     (joint,) = [each for each in report.joints if each.joint == row.joint]
+    fitted = report.identified.per_joint[row.joint]
     return (
         row.joint,
         plain(row.effect),
-        f"{mrad(joint.identified_fitted_rmse_rad)} with it, {mrad(row.without_rmse_rad)} without",
+        f"{mrad(fitted)} with it, {mrad(row.without_rmse_rad)} without",
         f"{mrad(joint.identified_rmse_rad)} with it, {mrad(row.without_held_out_rmse_rad)} without",
     )
 

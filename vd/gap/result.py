@@ -124,9 +124,6 @@ class JointGap:
     """One sentence: why this verdict."""
     open_sets: tuple[tuple[str, ...], ...] = ()
     """Effects that stand in for each other in this joint's good models, a set each."""
-    baseline_fitted_rmse_rad: float = math.nan
-    """On the motions that it was fitted to, as the next."""
-    identified_fitted_rmse_rad: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from vd.assets_usd.hand_data import HandModel
 from vd.command.files import write_json
 from vd.gap import rules
 from vd.gap.assemble import AnalysedJoint, assemble, curves
-from vd.gap.chain import Chain, chains, others_in, relative_torques
-from vd.gap.coordinates import PARAMETERS
+from vd.gap.chain import Chain, chains, others_in
+from vd.gap.coordinates import values_of
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, JointProblem, JointSpec, Problems
@@ -136,8 +136,6 @@ def explain(
     misfits = [Misfit(**misfit) for misfit in before["findings"]]
     joints = [analysed[spec] for spec in specs]
     report, predictions = assemble(problems, joints, misfits, chosen.seed)
-    relative = relative_torques(problems.recording)
-    report = replace(report, recording=replace(report.recording, relative_torques=relative))
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
     chosen.progress(f"explain: {report.verdict}")
@@ -200,7 +198,7 @@ class _JointAnalysis:
             if other.spec.chain == spec.chain:
                 base[other.spec.joint] = other.conclusion.final.rows[other.spec.joint]
         base[spec.joint] = chain.start_row[spec.joint]
-        start = baseline_values(rows[spec.joint], spec.baseline)
+        start = values_of(rows[spec.joint], spec.baseline)
         ((plain, scales),) = self.ask([partial(JointProblem.plain, base=base, start=start)])
         evidence = rules.Evidence(spec.floor, spec.folds, plain.rmse)
         loose = rules.undetermined(evidence, plain)
@@ -211,7 +209,7 @@ class _JointAnalysis:
             candidates=allowed,
             scales=scales,
             others=others_in(chain, spec.joint),
-            nominal=baseline_values(chain.start_row[spec.joint], spec.baseline),
+            nominal=values_of(chain.start_row[spec.joint], spec.baseline),
             evidence=evidence,
             models={frozenset(): plain},
         )
@@ -246,14 +244,6 @@ class _JointAnalysis:
 
 STAGES = 12
 """Batches of fits of a joint at most."""
-
-
-def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
-    """Values of a baseline's parameters in a row [PARAMETER_COLUMNS], by key."""
-    result = {}
-    for key in keys:
-        result[key] = float(row[PARAMETERS[key].column])
-    return result
 
 
 def _workers(problems: Problems, options: Options) -> WorkerPool:
