@@ -71,7 +71,6 @@ class Ladder:
         done: list[JointFit] = []
         while len(done) < ROUNDS and (centre := self.centre(done)):
             self.fit_changes(centre, FITTED)
-            self.prune()
             done.append(centre)
         completed: list[JointFit] = []
         while len(completed) < COMPLETED:
@@ -114,19 +113,6 @@ class Ladder:
         for effects, best in self.promising(centre, starts, additions).items():
             calls[effects] = self.call(effects, self.beginnings(centre, effects, best))
         self.fit(calls)
-
-    def prune(self) -> None:
-        """Fit the best model without what can be nothing in it, until nothing in it can."""
-        best = None
-        while best is not self.best():
-            best = self.best()
-            idle = rules.idle(self.evidence, best)
-            calls: dict[Effects, FitCall] = {}
-            for names in (*([name] for name in idle), idle):
-                effects = frozenset(best.effects) - {*names}
-                calls[effects] = self.call(effects, [within(best.values, effects)])
-            if idle:
-                self.fit(calls)
 
     def sizes_of(self, added: Iterable[str]) -> list[dict[str, float]]:
         """Starting values of effects together, by key: small with small, large with large."""
