@@ -109,11 +109,11 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     white = floor**2 * np.diag(np.linalg.inv(fit.gram + ridge))
     jackknife = (folds - 1) * fit.refits.var(axis=0)
     width = half_width(np.maximum(jackknife, white), folds)
-    sizes = np.array([1.0 if c.log else x for c, x in zip(fit.coordinates, fit.x, strict=True)])
-    width = np.hypot(width, half_width((OWN_ERROR * sizes) ** 2, np.inf))
-    width = np.hypot(width, fit.step_error)
+    own = half_width(np.square(OWN_ERROR), np.inf)
     result = {}
-    for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
+    for c, x, half, step in zip(fit.coordinates, fit.x, width, fit.step_error, strict=True):
+        size = 1.0 if c.log else x
+        w = np.hypot(np.hypot(half, own * size), step)
         low = c.value(max(x - w, c.lower))
         high = c.value(min(x + w, c.upper))
         result[c.key] = (float(low), float(high))
@@ -161,10 +161,14 @@ class JointProblem:
         self.folds = np.array(spec.folds)
         self.floor = spec.floor
         self.baseline = spec.baseline
-        of_trajectory = rollouts.sample_trajectory
-        parts = [rollouts.measured[of_trajectory == t, spec.joint] for t in spec.trajectories]
+        parts = []
+        counts = []
+        for trajectory in spec.trajectories:
+            own = rollouts.sample_trajectory == trajectory
+            parts.append(rollouts.measured[own, spec.joint])
+            counts.append(own.sum())
         self._measured = np.concatenate(parts)
-        self.count = np.array([len(part) for part in parts])
+        self.count = np.array(counts)
 
     def residuals(
         self, rows: np.ndarray, keep: np.ndarray | None = None, rollouts: Rollouts | None = None
@@ -233,12 +237,14 @@ class JointProblem:
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
-        others = others_in(self.rollouts.chain, self.joint)
-        slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
-        absent = set()
-        for slot in slots:
-            absent.add(f"joint_coupling.from_{slot + 1}")
-        return [*self.baseline, *(key for key in keys_of(effects) if key not in absent)]
+        keys = [*self.baseline, *keys_of(effects)]
+        for slot in {*range(servo.MAX_JOINTS)}.difference(
+            others_in(self.rollouts.chain, self.joint)
+        ):
+            absent = f"joint_coupling.from_{slot + 1}"
+            if absent in keys:
+                keys.remove(absent)
+        return keys
 
     def plain(
         self, base: np.ndarray, start: Mapping[str, float] | None = None
@@ -254,8 +260,9 @@ class JointProblem:
             row[PARAMETERS[key].column] = value
         scales = self.scales(row, self.floor)
         # One speed limit as it is, one that binds, one that does not.
-        limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
-        fit = self.fit(base, (), [{}, *limits] if start is None else [start], scales)
+        binding = {"velocity_limit": scales.speed}
+        free = {"velocity_limit": FREE_SPEED * scales.speed}
+        fit = self.fit(base, (), [{}, binding, free] if start is None else [start], scales)
         return fit, self.scales(fit.rows[self.joint], fit.rmse)
 
     def fit(
@@ -280,12 +287,11 @@ class JointProblem:
             The best.
         """
         coordinates = [coordinate(key, scales) for key in self.fitted(effects)]
-        x0 = []
-        for start in starts:
-            values = [start.get(c.key, base[self.joint, c.column]) for c in coordinates]
-            pairs = zip(coordinates, values, strict=True)
-            x0.append(np.array([c.inverse(float(value)) for c, value in pairs]))
-        x = _Descent(self, base, coordinates).best(x0, iterations)
+        x0 = np.empty((len(starts), len(coordinates)))
+        for i, c in enumerate(coordinates):
+            for row, start in zip(x0, starts, strict=True):
+                row[i] = c.inverse(float(start.get(c.key, base[self.joint, c.column])))
+        x = _Descent(self, base, coordinates).best([*x0], iterations)
         return self._judged(base, tuple(effects), coordinates, x)
 
     def _judged(
@@ -390,8 +396,9 @@ class _Descent:
         self.problem = problem
         self.base = base
         self.coordinates = coordinates
-        self.lower = np.array([c.lower for c in coordinates])
-        self.upper = np.array([c.upper for c in coordinates])
+        bounds = np.array([(c.lower, c.upper) for c in coordinates])
+        self.lower = bounds[:, 0]
+        self.upper = bounds[:, 1]
         self.pull = np.sqrt(RIDGE) * problem.floor
 
     def residuals(self, x: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
@@ -403,8 +410,9 @@ class _Descent:
         self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0
     ) -> np.ndarray:
         """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences, their steps times a factor."""
-        pairs = zip(self.coordinates, x, strict=True)
-        steps = np.array([c.step(float(value), widen) for c, value in pairs])
+        steps = np.empty(len(x))
+        for i, c in enumerate(self.coordinates):
+            steps[i] = c.step(float(x[i]), widen)
         moved = np.vstack([x, x + np.diag(steps)])
         rows = self.problem.rows(self.base, self.coordinates, moved)
         mask = None if keep is None else np.repeat(keep[None], len(moved), axis=0)
@@ -458,9 +466,9 @@ class _Descent:
         """
         left = list(starts)
         while len(left) > 1:
-            left = [self.descend(x, SHORT) for x in left]
-            left.sort(key=lambda x: float(np.sum(self.residuals(x) ** 2)))
-            left = left[: (len(left) + 1) // 2]
+            ends = [self.descend(x, SHORT) for x in left]
+            ends.sort(key=lambda x: float(np.sum(self.residuals(x) ** 2)))
+            left = ends[: (len(ends) + 1) // 2]
         x = self.descend(left[0], iterations)
         return self.descend(x, iterations, widen=WIDEN)
 

@@ -82,12 +82,11 @@ def find(
         fits = _identify(pool, problems.chains, specs, chosen)
     floors = {}
     rows = {}
+    models = []
     for spec, fit in zip(specs, fits, strict=True):
         name = problems.chains[spec.chain].joints[spec.joint]
         floors[name] = spec.floor
         rows[name] = {"rows": fit.rows.tolist()}
-    models = []
-    for spec, fit in zip(specs, fits, strict=True):
         models.append((spec, fit.rows))
     misfits = findings(problems.recording, curves(problems, models), floors)
     value = {
@@ -134,7 +133,7 @@ def explain(
             analysis = _JointAnalysis(pool, problems, spec, chosen, number / len(specs), len(specs))
             analysed[spec] = analysis.run(rows, list(analysed.values()))
     misfits = [Misfit(**misfit) for misfit in before["findings"]]
-    joints = [analysed[spec] for spec in specs]
+    joints = [*map(analysed.__getitem__, specs)]
     report, predictions = assemble(problems, joints, misfits, chosen.seed)
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
@@ -237,8 +236,8 @@ class _JointAnalysis:
                 means[name] = others
                 for other in others:
                     vetoes[other] = f"leaves the same positions as {name}, which stands for both"
-        names = rules.candidates(chain, self.options.effects)
-        names = [name for name in names if name not in vetoes]
+        allowed = rules.candidates(chain, self.options.effects)
+        names = [name for name in allowed if name not in vetoes]
         return names, vetoes, {**means, **TOGETHER}
 
 
@@ -259,30 +258,28 @@ def _problems(
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     parts = []
     specs = []
+    dt = STEP_S
     for index, chain in enumerate(chains(recording, hand)):
-        pairs = zip(chain.joints, chain.start_row, strict=True)
-        rows = []
-        for name, row in pairs:
-            rows.append(options.start.get(name, row))
-        parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
-        for joint, column in enumerate(chain.columns):
+        rows = chain.start_row.astype(float)
+        parts.append(replace(chain, start_row=rows))
+        for joint, name in enumerate(chain.joints):
+            rows[joint] = options.start.get(name, rows[joint])
             trajectories, folds, aside = design(recording, chain, joint)
             if trajectories:
-                specs.append(
-                    JointSpec(
-                        chain=index,
-                        joint=joint,
-                        trajectories=trajectories,
-                        folds=folds,
-                        floor=noise_floor(recording, int(column)),
-                        baseline=baseline_of(chain),
-                        pieces=pieces(recording, chain, trajectories),
-                        aside=aside,
-                    )
+                spec = JointSpec(
+                    chain=index,
+                    joint=joint,
+                    trajectories=trajectories,
+                    folds=folds,
+                    floor=noise_floor(recording, int(chain.columns[joint])),
+                    baseline=baseline_of(chain),
+                    pieces=pieces(recording, chain, trajectories),
+                    aside=aside,
                 )
-    # A recording so long that pieces of it are analysed would take minutes a joint with the usual
-    # step.
-    dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
+                specs.append(spec)
+                if spec.pieces:
+                    # A recording so long that pieces of it are analysed would take minutes a joint.
+                    dt = 2.0 * STEP_S
     return Problems(recording, parts, dt, options.device), specs
 
 
@@ -310,7 +307,7 @@ def _identify(
         share = 100.0 * (number + 1) / len(specs)
         line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
         options.progress(f"find: {share:3.0f} % {chain.joints[spec.joint]}: {line}")
-    if all(len(chain.joints) == 1 for chain in chains):
+    if len(chains) == sum(len(chain.joints) for chain in chains):
         return fits
     again = []
     for spec, fit in zip(specs, fits, strict=True):
