@@ -133,8 +133,8 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
         RecordingError: Objects do not fall by g along -z: another frame, unit or clock.
     """
     points = np.unique(np.concatenate([vertices for vertices, _ in item.hulls]), axis=0)
-    heights = [_lowest(motion, points) for motion in recording.motions]
-    state = _State(points, float(np.median([np.percentile(height, 5) for height in heights])))
+    heights = [np.percentile(_lowest(motion, points), 5) for motion in recording.motions]
+    state = _State(points, float(np.median(heights)))
     _check_gravity(recording, state)
 
     def equations(
@@ -148,31 +148,33 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
                 result.append((np.sum(grams, axis=0), np.sum(slopes, axis=0)))
         return result
 
-    found = {}
-    found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
+    centre = _judge("centre_of_mass", equations("drop", _flights), item)
     if centre.verdict == "effect":  # impacts need it
         state.centre = centre.value
     # What is known within bounds only widens an interval by what it does to the estimate.
-    bounces = []
-    for state.unseen in (0.0, 1.0, 0.5):
-        bounces.append(equations("drop", _impacts))
-    spread = np.abs(_estimate(bounces[1], 1)[0] - _estimate(bounces[0], 1)[0]) / math.sqrt(12.0)
-    found["restitution"] = _judge("restitution", bounces[2], item, spread)
-    found["table_friction"] = friction = _judge("table_friction", equations("slide", _slides), item)
-    pushes = []
-    for (state.friction,) in (friction.low, friction.high, friction.value):
-        pushes.append(equations("push", _pushes))
-    spread = np.abs(_estimate(pushes[1], 1)[0] - _estimate(pushes[0], 1)[0]) / 4.0
-    found["mass"] = _judge("mass", pushes[2], item, spread)
-    found["tip_compliance"] = _judge("tip_compliance", equations("press", _presses), item)
-    return [found[name] for name in CONTACT]
+    state.unseen = 0.0
+    least, _ = _estimate(equations("drop", _impacts), 1)
+    state.unseen = 1.0
+    most, _ = _estimate(equations("drop", _impacts), 1)
+    state.unseen = 0.5
+    spread = np.abs(most - least) / math.sqrt(12.0)
+    restitution = _judge("restitution", equations("drop", _impacts), item, spread)
+    friction = _judge("table_friction", equations("slide", _slides), item)
+    state.friction = float(friction.low[0])
+    least, _ = _estimate(equations("push", _pushes), 1)
+    state.friction = float(friction.high[0])
+    most, _ = _estimate(equations("push", _pushes), 1)
+    state.friction = float(friction.value[0])
+    spread = np.abs(most - least) / 4.0
+    mass = _judge("mass", equations("push", _pushes), item, spread)
+    compliance = _judge("tip_compliance", equations("press", _presses), item)
+    found = [friction, restitution, mass, centre, compliance]
+    return sorted(found, key=lambda each: [*CONTACT].index(each.name))
 
 
 def verdict(found: Sequence[ContactEstimate]) -> Literal["effects", "no_gap", "under_excited"]:
     """What the recording says as a whole, in the words of ``vd-gap run``."""
-    told = set()
-    for each in found:
-        told.add(each.verdict)
+    told = {each.verdict for each in found}
     return "effects" if "effect" in told else "no_gap" if "no_gap" in told else "under_excited"
 
 
@@ -230,7 +232,8 @@ def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarr
     blank = np.full(size, np.nan)
     if count < 3:
         return blank, blank
-    gram, slope = (np.array(arrays) for arrays in zip(*motions, strict=True))
+    gram = np.array([each for each, _ in motions])
+    slope = np.array([each for _, each in motions])
     try:
         value = np.linalg.solve(gram.sum(0), slope.sum(0))
         others = np.linalg.solve(gram.sum(0) - gram, (slope.sum(0) - slope)[..., None])[..., 0]
@@ -281,10 +284,9 @@ def _stretches(mask: np.ndarray) -> Iterator[slice]:
 def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
     """Stretches in which nothing touches the object."""
     found = list(_stretches(_lowest(motion, state.points) > state.table_m + CLEAR_M))
-    result = []
-    for i, part in enumerate(found):
-        result.append(_released(motion, part) if i == 0 else part)
-    return result
+    if found:
+        found[0] = _released(motion, found[0])
+    return found
 
 
 def _released(motion: ContactMotion, part: slice) -> slice:
@@ -323,7 +325,9 @@ def _check_gravity(recording: ContactRecording, state: _State) -> None:
     """Refuse drops that do not fall as things do."""
     falls = []
     for motion in recording.motions:
-        for part in _in_flight(motion, state) if motion.kind == "drop" else ():
+        if motion.kind != "drop":
+            continue
+        for part in _in_flight(motion, state):
             time = motion.time[part] - motion.time[part].mean()
             if np.ptp(time) > SURE_S:
                 falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
@@ -436,9 +440,8 @@ def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
     margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
     for whole in _stretches(sliding):
-        part = slice(
-            whole.start + margin, whole.stop - margin
-        )  # velocities at the ends are of other motions too
+        # Velocities at the ends are of other motions too.
+        part = slice(whole.start + margin, whole.stop - margin)
         time = motion.time[part]
         ahead = velocity[part] / speed[part, None]
         if len(time) >= FEWEST:

@@ -77,8 +77,9 @@ def _write(path: Path, comment: str, text: str, joints: "list[JointModel]") -> N
     """Write a file with what it lacks at its head, and say that."""
     lost = []
     for joint in joints:
-        left = sorted(joint.numbers.keys() - joint.taken)
-        lost += [f"{joint.name} lacks {key} = {joint.numbers[key][0]:.4g}" for key in left]
+        for key in sorted(joint.numbers.keys() - joint.taken):
+            value = joint.numbers[key][0]
+            lost.append(f"{joint.name} lacks {key} = {value:.4g}")
         joint.taken.clear()
     head = "".join(map(comment.format, ["Identified by vd-gap.", *lost]))
     write_text(path, head + text)
@@ -117,7 +118,7 @@ def read_joints(layer: Path, hand: str | None) -> list[JointModel]:
         rows, intervals = read_bare_layer(layer, names)
     else:
         model = load_hand(hand, layer=layer)
-        index = [model.joint_names.index(name) for name in names]
+        index = [*map(model.joint_names.index, names)]
         rows = model.servo[index]
         intervals = model.servo_interval[index]
     joints = []

@@ -81,10 +81,10 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         gap=gap,
         overlays=overlays,
         residuals=residuals,
-        trajectories=[_trajectory_row(row) for row in report.trajectories],
-        families=[_family_row(row) for row in report.families],
-        models=[_model_row(row) for row in report.models],
-        compared=[_model_row(row) for row in report.compared],
+        trajectories=[*map(_trajectory_row, report.trajectories)],
+        families=[*map(_family_row, report.families)],
+        models=[*map(_model_row, report.models)],
+        compared=[*map(_model_row, report.compared)],
         credits=[_credit_row(report, row) for row in report.credits],
         not_tried=_not_tried(report),
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
@@ -95,8 +95,8 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
 
 def _headline(report: Report) -> list[Row]:
     held = report.held_out
-    names = dict.fromkeys(plain(effect.name) for effect in report.effects)
-    answer = words.listing(names or ["nothing named"])
+    names = dict.fromkeys(effect.name for effect in report.effects)
+    answer = words.causes(names or ["nothing named"], "and")
     before = (
         f"held out, the plain servo model; {mrad(report.baseline.rmse_rad)} where it was fitted"
     )
@@ -134,7 +134,9 @@ def _trajectory_row(row: TrajectoryError) -> Row:
 def _not_tried(report: Report) -> list[Row]:
     rows: list[Row] = []
     for joint, reasons in report.not_tried.items():
-        rows += [(joint, plain(name), plain(reason)) for name, reason in reasons.items()]
+        for name, reason in reasons.items():
+            why = plain(reason)
+            rows.append((joint, plain(name), why))
     return rows
 
 

@@ -64,9 +64,8 @@ def battery(
     numbers = range(first_seed, first_seed + seeds)
 
     def sized(kind: str, among: Sequence[str]) -> list[Case]:
-        each = itertools.product(numbers, sizes, among)
         result = []
-        for seed, size, name in each:
+        for seed, size, name in itertools.product(numbers, sizes, among):
             result.append(Case(kind, model, (name,), size, seed, battery=which))
         return result
 

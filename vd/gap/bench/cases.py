@@ -47,10 +47,15 @@ def run_cases(
     """
     make_folder(folder)
     done = {}
+    missing = []
+    failed = []
     for case in cases:
         done[case] = read_result(folder / f"{case.name}.json")
-    failed = [case for case in cases if "error" in (done[case] or {})]
-    waiting = [*(case for case in cases if done[case] is None), *failed]
+        if done[case] is None:
+            missing.append(case)
+        elif "error" in done[case]:
+            failed.append(case)
+    waiting = missing + failed
     print(
         f"{len(cases) - len(waiting)} of {len(cases)} cases have results; {len(waiting)} to run",
         flush=True,
