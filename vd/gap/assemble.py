@@ -68,7 +68,7 @@ class AnalysedJoint:
         return self.conclusion.final
 
 
-def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
+def curves(problems: Problems, specs: Sequence[JointSpec], fits: Sequence[JointFit]) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad].
 
     NaN where no joint was fitted.
@@ -77,18 +77,19 @@ def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -
 
     Args:
         problems: Of the recording.
-        models: Problem and parameter rows of each fitted joint.
+        specs: The fitted joints.
+        fits: Their models.
     """
     recording = problems.recording
-    parts = [np.full(trajectory.position.shape, np.nan) for trajectory in recording.trajectories]
-    result = np.concatenate(parts)
+    samples = sum(len(trajectory.time) for trajectory in recording.trajectories)
+    result = np.full((samples, len(recording.joints)), np.nan)
     step = problems.dt / FINER[-1]
     for index, chain in enumerate(problems.chains):
         rows = chain.start_row.copy()
         fitted = False
-        for spec, own in models:
+        for spec, fit in zip(specs, fits, strict=True):
             if spec.chain == index:
-                rows[spec.joint] = own[spec.joint]
+                rows[spec.joint] = fit.rows[spec.joint]
                 fitted = True
         if fitted:
             rollouts = Rollouts(chain, recording, dt=step, device=problems.device)
@@ -102,8 +103,9 @@ def assemble(
     """The report of all joints, and the curves of its figures."""
     recording = problems.recording
     rng = np.random.default_rng(seed)
-    plain: list[tuple[JointSpec, JointFit]] = []
-    final: list[tuple[JointSpec, JointFit]] = []
+    specs: list[JointSpec] = []
+    plain: list[JointFit] = []
+    final: list[JointFit] = []
     errors: list[TrajectoryError] = []
     gaps: list[JointGap] = []
     effects: list[NamedEffect] = []
@@ -115,8 +117,9 @@ def assemble(
     not_tried: dict[str, dict[str, str]] = {}
     aside: dict[str, str] = {}
     for joint in joints:
-        plain.append((joint.spec, joint.plain))
-        final.append((joint.spec, joint.final))
+        specs.append(joint.spec)
+        plain.append(joint.plain)
+        final.append(joint.final)
         rows = _errors(joint, recording)
         errors += rows
         gaps.append(_gap(joint, rows, rng))
@@ -132,25 +135,23 @@ def assemble(
         if joint.spec.aside is not None:
             aside[joint.name] = recording.trajectories[joint.spec.aside].file
     floors = np.array([gap.noise_floor_rad for gap in gaps])
-    names = tuple(gap.joint for gap in gaps)
-    before = curves(problems, [(spec, fit.rows) for spec, fit in plain])
-    after = curves(problems, [(spec, fit.rows) for spec, fit in final])
-    predictions = Predictions.of(recording, before, after)
+    before = curves(problems, specs, plain)
+    predictions = Predictions.of(recording, before, curves(problems, specs, final))
     report = Report(
         verdict=rules.overall([gap.verdict for gap in gaps]),
         noise_floor_rad=float(np.sqrt(np.mean(floors**2))),
-        baseline=_fitted(names, plain),
+        baseline=_fitted(joints, plain),
         findings=tuple(findings),
         effects=tuple(effects),
         ambiguous=_sets(joints),
-        identified=_fitted(names, final),
+        identified=_fitted(joints, final),
         held_out=_held_out(errors, rng),
         next_experiment="",
         seconds=np.nan,
         recording=AnalysedRecording(
             path=str(recording.path),
             model=recording.model,
-            joints=names,
+            joints=tuple(joint.name for joint in joints),
             trajectories=len(recording.trajectories),
             samples=len(predictions.time),
             seconds=sum(trajectory.duration for trajectory in recording.trajectories),
@@ -193,19 +194,19 @@ def _errors(joint: AnalysedJoint, recording: Recording) -> list[TrajectoryError]
     return rows
 
 
-def _fitted(names: Sequence[str], fits: Sequence[tuple[JointSpec, JointFit]]) -> FittedModel:
+def _fitted(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> FittedModel:
     """Errors of a model of each joint on what it was fitted to, and its baseline's parameters."""
     squares = 0.0
     absolute = 0.0
     count = 0.0
     per_joint = {}
     parameters = {}
-    for name, (spec, fit) in zip(names, fits, strict=True):
+    for joint, fit in zip(joints, fits, strict=True):
         squares += fit.sse.sum()
         absolute += fit.absolute.sum()
         count += fit.count.sum()
-        per_joint[name] = fit.rmse
-        parameters[name] = _baseline_values(spec, fit)
+        per_joint[joint.name] = fit.rmse
+        parameters[joint.name] = _baseline_values(joint.spec, fit)
     return FittedModel(
         rmse_rad=float(np.sqrt(squares / count)),
         per_joint=per_joint,

@@ -207,8 +207,9 @@ def _finger(recording: Recording, hand: HandModel, finger: slice, p_gain: float 
         mass[i] = masses.sum()
         centre = masses @ centres[links] / mass[i]
         com[i] = centre - origins[i]
-        for m, arm, about in zip(masses, centres[links] - centre, turned[links], strict=True):
-            inertia[i] += about + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        arms = centres[links] - centre
+        spread = masses * arms.T @ arms
+        inertia[i] = turned[links].sum(axis=0) + np.trace(spread) * np.eye(3) - spread
     rows = np.tile(neutral_row(), (n, 1))
     rows[:, servo.KP] = hand.kp[joints]
     rows[:, servo.KD] = hand.kd[joints]

@@ -21,6 +21,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial.polynomial import polyfit
+from scipy.ndimage import find_objects, label
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
@@ -35,6 +37,8 @@ FALSE_NAMES = 0.02
 """Share of recordings without a gap in which any name may be given; split evenly over all
 numbers.
 """
+NUMBERS = sum(len(parameter.nominal) for parameter in CONTACT.values())
+"""Of all parameters, which together may give a false name in that share of recordings."""
 OUTLIER = 3.5
 """Residuals beyond this many standard deviations, by the median, are samples that came late."""
 FEWEST = 5
@@ -197,9 +201,7 @@ def _judge(
     value, deviation = _estimate(motions, len(nominal))
     deviation = np.hypot(deviation, besides)
     freedom = max(len(motions) - 1, 1)
-    # All numbers of all parameters together may give a false name in FALSE_NAMES of recordings.
-    numbers = sum(len(p.nominal) for p in CONTACT.values())
-    half = student.ppf(1.0 - 0.5 * FALSE_NAMES / numbers, freedom) * deviation
+    half = student.ppf(1.0 - 0.5 * FALSE_NAMES / NUMBERS, freedom) * deviation
     gap = np.abs(value - nominal)
     least = np.maximum(half, resolution)
     told = bool(np.isfinite(deviation).all())
@@ -260,25 +262,30 @@ def _lowest(motion: ContactMotion, points: np.ndarray) -> np.ndarray:
     return motion.position[:, 2] + (motion.rotation.as_matrix()[:, 2] @ points.T).min(1)
 
 
-def _velocity(motion: ContactMotion) -> np.ndarray:
-    """Horizontal velocity [T, 2] by parabolas through :data:`SMOOTH_S` of evenly spaced samples."""
+def _step(motion: ContactMotion) -> float:
+    """Usual time between two samples [s]."""
+    return float(np.median(np.diff(motion.time)))
+
+
+def _velocity(motion: ContactMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal velocity [T, 2] and its size [T], by parabolas through :data:`SMOOTH_S`."""
     time = motion.time
-    step = float(np.median(np.diff(time)))
+    step = _step(motion)
     even = np.arange(time[0], time[-1] + step, step)
     window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
-    columns = []
-    for values in motion.position.T[:2]:
-        smooth = savgol_filter(np.interp(even, time, values), window, 2, deriv=1, delta=step)
-        columns.append(np.interp(time, even, smooth))
-    return np.stack(columns, axis=1)
+    velocity = np.empty((len(time), 2))
+    for axis in range(2):
+        position = np.interp(even, time, motion.position[:, axis])
+        smooth = savgol_filter(position, window, 2, deriv=1, delta=step)
+        velocity[:, axis] = np.interp(time, even, smooth)
+    return velocity, np.linalg.norm(velocity, axis=1)
 
 
 def _stretches(mask: np.ndarray) -> Iterator[slice]:
     """Runs of true samples, long enough to be evidence."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    for first, end in zip(edges[::2], edges[1::2], strict=True):
-        if end - first >= FEWEST:
-            yield slice(int(first), int(end))
+    for (part,) in find_objects(label(mask)[0]):
+        if part.stop - part.start >= FEWEST:
+            yield part
 
 
 def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
@@ -353,8 +360,7 @@ def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
 def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Path along the direction of a slide = s0 + v t - mu g t^2 / 2."""
     time = motion.time
-    velocity = _velocity(motion)
-    speed = np.linalg.norm(velocity, axis=1)
+    velocity, speed = _velocity(motion)
     free = (time > time[speed.argmax()] + SMOOTH_S) & (speed > SLIDING * speed.max())
     for part in _stretches(free & _flat_on_table(motion, state)):
         since = time[part] - time[part].mean()
@@ -376,11 +382,9 @@ def _flat_on_table(motion: ContactMotion, state: _State) -> np.ndarray:
 def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Speed of the touching points after an impact = e times before."""
     flights = _in_flight(motion, state)
-    step = float(np.median(np.diff(motion.time)))
     # Of the fastest bounce with too few samples above CLEAR_M.
-    unseen = math.sqrt(
-        2.0 * GRAVITY_M_S2 * (CLEAR_M + GRAVITY_M_S2 * (0.5 * FEWEST * step) ** 2 / 2.0)
-    )
+    fall = 0.5 * GRAVITY_M_S2 * (0.5 * FEWEST * _step(motion)) ** 2
+    unseen = math.sqrt(2.0 * GRAVITY_M_S2 * (CLEAR_M + fall))
     for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
             return
@@ -409,36 +413,30 @@ def _touch(
     edge = -1 if touching is None else 0
     since = time - time[edge]
     centre = motion.position[part] + motion.rotation[part].apply(state.centre)
-    height, rise = np.polynomial.polynomial.polyfit(
-        since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1
-    )
+    height, rise = polyfit(since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1)
     near = np.abs(since) < SMOOTH_S
     base = motion.rotation[part][edge]
     turned = (motion.rotation[part][near] * base.inv()).as_rotvec()
-    turn, spin = np.polynomial.polynomial.polyfit(since[near], turned, 1)
+    turn, spin = polyfit(since[near], turned, 1)
     times = np.linspace(-0.5 * SMOOTH_S, 0.5 * SMOOTH_S, 501)
     turns = (Rotation.from_rotvec(turn + times[:, None] * spin) * base).as_matrix()
     arms = turns @ (state.points - state.centre).T  # [501, 3, N]
     above = height + rise * times - 0.5 * GRAVITY_M_S2 * times**2 - state.table_m
     if touching is None:
-        first = int(np.abs(above + arms[:, 2].min(1)).argmin())
-        touching = arms[first, 2] < arms[first, 2].min() + FLAT_M
-    at = int(np.abs(above + arms[:, 2, touching].mean(1)).argmin())
-    arm = arms[at][:, touching].mean(1)
-    return (
-        time[edge] + times[at],
-        rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arm)[2],
-        touching,
-    )
+        first = arms[np.abs(above + arms[:, 2].min(1)).argmin(), 2]
+        touching = first < first.min() + FLAT_M
+    arms = arms[:, :, touching].mean(2)
+    at = np.abs(above + arms[:, 2]).argmin()
+    speed = rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arms[at])[2]
+    return time[edge] + times[at], speed, touching
 
 
 def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
-    velocity = _velocity(motion)
-    speed = np.linalg.norm(velocity, axis=1)
+    velocity, speed = _velocity(motion)
     pressing = np.linalg.norm(motion.force, axis=1) > PRESSED_N
     sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
-    margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
+    margin = round(SMOOTH_S / _step(motion))
     for whole in _stretches(sliding):
         # Velocities at the ends are of other motions too.
         part = slice(whole.start + margin, whole.stop - margin)

@@ -60,8 +60,7 @@ def design(
         labels.append(str(value))
     kinds = sorted({*labels})
     if len(kinds) < 2:
-        labels = [*map(str, trajectories)]
-        kinds = labels
+        kinds = labels = [*map(str, trajectories)]
     folds = tuple(kinds.index(label) % MAX_FOLDS for label in labels)
     return tuple(trajectories), folds, aside
 

@@ -116,8 +116,11 @@ def _headline(report: Report) -> list[Row]:
 
 
 def _joint_row(report: Report, one: JointGap) -> Row:
-    own = [finding.where for finding in report.findings if finding.joint == one.joint]
-    where = [text.removeprefix(f"{one.joint}: ") for text in own]
+    where = []
+    for finding in report.findings:
+        joint, _, text = finding.where.partition(": ")
+        if joint == one.joint:
+            where.append(text)
     return (
         one.joint,
         "; ".join(where) or "nothing",

@@ -295,9 +295,10 @@ def too_few(fit: JointFit) -> str:
 
 def scores(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
     """Log of the error of C models plus the price of what they have [C]."""
-    error = np.log(np.maximum(rmse(errors(evidence, fits), fits[0].count), 1e-12))
-    sizes = [len(fit.effects) + len(fit.x) - len(fits[0].x) for fit in fits]
-    return error + PENALTY * np.array(sizes, float)
+    result = np.log(np.maximum(rmse(errors(evidence, fits), fits[0].count), 1e-12))
+    for i, fit in enumerate(fits):
+        result[i] += PENALTY * (len(fit.effects) + len(fit.x) - len(fits[0].x))
+    return result
 
 
 def errors(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
@@ -611,7 +612,9 @@ def families_of(
     coins, are not to be expected; untold if not.
     """
     motions = len(good[0].count)
-    tried = {*itertools.chain.from_iterable(fit.effects for fit in fits)}
+    tried: set[str] = set()
+    for fit in fits:
+        tried.update(fit.effects)
     result: dict[str, Certainty] = {}
     for name, family in FAMILIES.items():
         best = 0.0
@@ -632,12 +635,20 @@ def families_of(
 
 def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
     """Effects that stand in for each other in the good models, a set each."""
-    names = list(dict.fromkeys(itertools.chain.from_iterable(fit.effects for fit in good)))
-    having = np.array([[name in fit.effects for name in names] for fit in good])
-    loose = np.flatnonzero(~having.all(axis=0))
-    together = having[:, loose].T @ having[:, loose]
-    count, labels = connected_components(~together)
-    return [tuple(names[i] for i in loose[labels == group]) for group in range(count)]
+    models: dict[str, set[int]] = {}
+    for index, fit in enumerate(good):
+        for name in fit.effects:
+            models.setdefault(name, set()).add(index)
+    loose = [name for name in models if len(models[name]) < len(good)]
+    apart = np.zeros((len(loose), len(loose)))
+    for i, name in enumerate(loose):
+        for j, other in enumerate(loose):
+            apart[i, j] = models[name].isdisjoint(models[other])
+    count, labels = connected_components(apart)
+    sets: list[tuple[str, ...]] = [()] * count
+    for name, group in zip(loose, labels, strict=True):
+        sets[group] += (name,)
+    return sets
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:

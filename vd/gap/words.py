@@ -72,8 +72,9 @@ def amount(value: float, unit: str) -> str:
 def estimate(one: Estimate) -> str:
     """``40.2 ms (95 %: 39.1 to 41.3)``."""
     factor, shown = _size(one.value, one.unit)
-    value, low, high = (f"{factor * x:.4g}" for x in (one.value, *one.ci95))
-    return f"{value} {shown}".strip() + f" (95 %: {low} to {high})"
+    low, high = one.ci95
+    value = f"{factor * one.value:.4g} {shown}".strip()
+    return f"{value} (95 %: {factor * low:.4g} to {factor * high:.4g})"
 
 
 def effects_sentence(effects: Iterable[NamedEffect]) -> str:
@@ -189,8 +190,8 @@ def _leftover(report: Report) -> str:
 def _besides(report: Report) -> str:
     """What else the names may stand for, and what else is missing."""
     text = ""
-    if "encoder_bias" in [effect.name for effect in report.effects]:
-        text += (
+    if any(effect.name == "encoder_bias" for effect in report.effects):
+        text = (
             " An encoder bias is first of all a difference of zeros between command and reading: "
             "compare them before you use the model."
         )

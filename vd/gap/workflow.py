@@ -82,13 +82,11 @@ def find(
         fits = _identify(pool, problems.chains, specs, chosen)
     floors = {}
     rows = {}
-    models = []
     for spec, fit in zip(specs, fits, strict=True):
         name = problems.chains[spec.chain].joints[spec.joint]
         floors[name] = spec.floor
         rows[name] = {"rows": fit.rows.tolist()}
-        models.append((spec, fit.rows))
-    misfits = findings(problems.recording, curves(problems, models), floors)
+    misfits = findings(problems.recording, curves(problems, specs, fits), floors)
     value = {
         "format": FIND_FORMAT,
         "findings": [asdict(misfit) for misfit in misfits],
@@ -289,9 +287,9 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
     Without known masses, torques are known up to a factor: a pendulum's load holds it if known, the
     nominal stiffness if not.
     """
-    anchor = ""
-    if not chain.bodies:
-        anchor = "tau_g_nm" if chain.reference_load is not None else "kp"
+    if chain.bodies:
+        return chain.baseline_free
+    anchor = "tau_g_nm" if chain.reference_load is not None else "kp"
     return tuple(name for name in chain.baseline_free if name != anchor)
 
 
@@ -307,7 +305,7 @@ def _identify(
         share = 100.0 * (number + 1) / len(specs)
         line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
         options.progress(f"find: {share:3.0f} % {chain.joints[spec.joint]}: {line}")
-    if len(chains) == sum(len(chain.joints) for chain in chains):
+    if not chains[0].bodies:
         return fits
     again = []
     for spec, fit in zip(specs, fits, strict=True):

@@ -59,7 +59,7 @@ def battery(
     for name in effects:
         if name not in shown:
             raise ValueError(f"--effects: there is no {name}; choose from {', '.join(shown)}")
-    names = tuple(effects) or tuple(name for name in shown if name not in NOT_NAMED)
+    names = effects or [name for name in shown if name not in NOT_NAMED]
     changes = ("exact", "base", "mass") if model in HANDS else ("exact", "base")
     numbers = range(first_seed, first_seed + seeds)
 
@@ -82,7 +82,7 @@ def battery(
         "pair": pairs,
         "outside": sized("outside", (*OUTSIDE, *NOT_NAMED)),
     }
-    return list(itertools.chain.from_iterable(cases[kind] for kind in kinds))
+    return [*itertools.chain(*map(cases.__getitem__, kinds))]
 
 
 def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:

@@ -243,9 +243,8 @@ def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generat
         inertia = world.model.body_inertia[1, 2]
         ahead = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi)).apply(ahead)
         push = mass * (speed / PUSH_OFF_S + world.friction * GRAVITY_M_S2) * ahead
-        return world.run(
-            0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S])
-        )
+        twist = inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S
+        return world.run(0.6, hand=np.array([*push, 0.0, 0.0, twist]))
     if kind == "press":
         above = np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004])
         force = rng.uniform(3.0, 8.0)
@@ -268,15 +267,14 @@ def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bo
     velocity = np.array([*rng.normal(0.0, 0.1, 2), 0.0 if flat else rng.uniform(0.8, 1.6)])
     spin = rng.normal(0.0, 0.1 if flat else 5.0, 3)
     world.place(place, tilt, velocity, spin)
-    time, pose, pusher, force = world.run(0.8)
+    time, pose, _, _ = world.run(0.8)
     before = np.arange(0.0, PUSH_OFF_S, world.step)
     way = 0.5 * before**2 / PUSH_OFF_S - 0.5 * PUSH_OFF_S
     turned = Rotation.from_rotvec(np.outer(way, spin)) * tilt
     held = np.hstack([place + np.outer(way, velocity), turned.as_quat()])
-    nothing = np.zeros((len(before), 3))
-    parts = (held, pose), (nothing, pusher), (nothing, force)
-    pose, pusher, force = (np.concatenate(part) for part in parts)
-    return np.concatenate([before, time + PUSH_OFF_S]), pose, pusher, force
+    time = np.concatenate([before, time + PUSH_OFF_S])
+    nothing = np.zeros((len(time), 3))
+    return time, np.concatenate([held, pose]), nothing, nothing
 
 
 class ImperfectTracker:
@@ -302,10 +300,8 @@ class ImperfectTracker:
         time, pose, pusher, force = truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
         asked = asked[rng.uniform(size=len(asked)) > 0.02]
-        late = (
-            rng.exponential(self.late_s, len(asked))
-            + (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
-        )
+        late = rng.exponential(self.late_s, len(asked))
+        late += (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
         at = np.searchsorted(time, asked - late).clip(0, len(time) - 1)
 
         def noisy(values: np.ndarray, deviation: float) -> np.ndarray:
@@ -314,12 +310,12 @@ class ImperfectTracker:
         turned = Rotation.from_rotvec(rng.normal(0.0, self.rotation_rad, (len(at), 3)))
         position = noisy(pose, self.position_m)
         rotation = turned * Rotation.from_quat(pose[at, 3:])
-        pushes = kind in ("push", "press")
         bias = rng.normal(0.0, self.force_n / 3.0, 3)
-        measured = (noisy(pusher, self.position_m), noisy(force, self.force_n) + bias)
-        return ContactMotion(
-            file, kind, asked, position, rotation, *(measured if pushes else [np.empty((0, 3))] * 2)
-        )
+        pusher = noisy(pusher, self.position_m)
+        force = noisy(force, self.force_n) + bias
+        if kind not in ("push", "press"):
+            pusher = force = np.empty((0, 3))
+        return ContactMotion(file, kind, asked, position, rotation, pusher, force)
 
 
 def hide_contact(

@@ -133,7 +133,7 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     """
     floor = truth["noise_floor_rad"]
     named = list(dict.fromkeys(effect["name"] for effect in report["effects"]))
-    sets = [list(group) for group in report["ambiguous"]]
+    sets = [*map(list, report["ambiguous"])]
     hidden = {*case.effects}
     found = hidden.intersection(named)
     right = hidden.union(MASS_EFFECTS) if case.change == "mass" else {*hidden}
@@ -288,7 +288,7 @@ def figures(results: Results) -> list[Figure]:
 
 def _first_right(result: Mapping[str, Any]) -> bool:
     """The named effect, or the first of the set, is the hidden one, or what stands for it."""
-    first = result["named"][:1] or [group[0] for group in result["sets"][:1]]
+    first = [*result["named"], *itertools.chain(*result["sets"])][:1]
     hidden = list(result["case"]["effects"])
     return first == hidden or (_all_found(result) and len(result["named"]) == len(hidden))
 
