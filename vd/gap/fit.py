@@ -208,42 +208,35 @@ class JointProblem:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
         chain = self.rollouts.chain
         column = int(chain.columns[self.joint])
-        speeds = []
-        accelerations = []
-        errors = []
-        durations = []
+        parts = []
+        duration = 0.0
         for index in self.trajectories:
             trajectory = self.rollouts.recording.trajectories[index]
-            speed = speed_of(trajectory.time, trajectory.position[:, column])
-            speeds.append(speed)
-            accelerations.append(speed_of(trajectory.time, speed))
-            errors.append(trajectory.command[:, column] - trajectory.position[:, column])
-            durations.append(trajectory.duration)
-        torque = row[servo.KP] * np.concatenate(errors)
-
-        def peak(values: np.ndarray) -> float:
-            return float(np.percentile(np.abs(values), 99.5))
-
+            position = trajectory.position[:, column]
+            speed = speed_of(trajectory.time, position)
+            torque = row[servo.KP] * (trajectory.command[:, column] - position)
+            parts.append([speed, speed_of(trajectory.time, speed), torque])
+            duration = max(duration, trajectory.duration)
+        motion = np.concatenate(parts, axis=1)
+        top_speed, acceleration, peak = np.percentile(np.abs(motion), 99.5, axis=1).tolist()
         return Scales(
             kp=float(row[servo.KP]),
-            torque=float(np.sqrt(np.mean(torque**2))) + 1e-9,
-            peak=peak(torque) + 1e-9,
-            speed=peak(np.concatenate(speeds)) + 1e-3,
-            acceleration=peak(np.concatenate(accelerations)) + 0.1,
+            torque=float(np.sqrt(np.mean(motion[2] ** 2))) + 1e-9,
+            peak=peak + 1e-9,
+            speed=top_speed + 1e-3,
+            acceleration=acceleration + 0.1,
             inertia=max(float(row[servo.INERTIA]) + chain.inertia_scale(self.joint), 1e-6),
             residual=residual,
-            duration=max(durations),
+            duration=duration,
         )
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
         keys = [*self.baseline, *keys_of(effects)]
-        for slot in {*range(servo.MAX_JOINTS)}.difference(
-            others_in(self.rollouts.chain, self.joint)
-        ):
-            absent = f"joint_coupling.from_{slot + 1}"
-            if absent in keys:
-                keys.remove(absent)
+        for slot in range(servo.MAX_JOINTS):
+            coupling = f"joint_coupling.from_{slot + 1}"
+            if coupling in keys and slot not in others_in(self.rollouts.chain, self.joint):
+                keys.remove(coupling)
         return keys
 
     def plain(
