@@ -90,7 +90,7 @@ def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
     for joint, finger, motor in zip(hand.joint_names, hand.joint_finger, hand.motors, strict=True):
         kind = None if motor is None else replace(motor, id=0, sign=1.0, offset_rad=0.0)
         like[joint] = joint.partition("_")[2], np.count_nonzero(hand.joint_finger == finger), kind
-    others = {}
+    others: dict[str, str] = {}
     for joint in hand.joint_names:
         for own in () if joint in known else known:
             if like[joint] == like[own]:

@@ -50,10 +50,11 @@ def run_cases(
     missing = []
     failed = []
     for case in cases:
-        done[case] = read_result(folder / f"{case.name}.json")
-        if done[case] is None:
+        result = read_result(folder / f"{case.name}.json")
+        done[case] = result
+        if result is None:
             missing.append(case)
-        elif "error" in done[case]:
+        elif "error" in result:
             failed.append(case)
     waiting = missing + failed
     print(
