@@ -140,8 +140,8 @@ class Analysis:
             moved.update(trajectory.joints)
         joints = [joint for joint in self.recording.joints if joint in moved]
         if self.hand is not None:
-            index = [*map(self.hand.joint_names.index, joints)]
-            return dict(zip(joints, self.hand.servo[index], strict=True))
+            rows = dict(zip(self.hand.joint_names, self.hand.servo, strict=True))
+            return {joint: rows[joint] for joint in joints if joint in rows}
         from vd.assets_usd.hand_layer import read_bare_layer
 
         found, _ = read_bare_layer(self.settings.hand_layer, joints)
