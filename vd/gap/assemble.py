@@ -219,7 +219,7 @@ def _baseline_values(spec: JointSpec, fit: JointFit) -> dict[str, float]:
     """Parameters of the plain servo in a model."""
     row = fit.rows[spec.joint]
     names = ["kp", "kd", "velocity_limit"]
-    names += [name for name in ("inertia", "kd_off") if name in spec.baseline]
+    names += sorted({"inertia", "kd_off"}.intersection(spec.baseline))
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and row[GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)

@@ -234,8 +234,7 @@ def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarr
     blank = np.full(size, np.nan)
     if count < 3:
         return blank, blank
-    gram = np.array([each for each, _ in motions])
-    slope = np.array([each for _, each in motions])
+    gram, slope = map(np.array, zip(*motions, strict=True))
     try:
         value = np.linalg.solve(gram.sum(0), slope.sum(0))
         others = np.linalg.solve(gram.sum(0) - gram, (slope.sum(0) - slope)[..., None])[..., 0]

@@ -72,4 +72,4 @@ def run_cases(
         print(f"[{next(numbers)}/{len(waiting)}] {case.name}: {answer}", flush=True)
 
     run_tasks(work, waiting, finished, jobs=jobs, limit_s=limit_s, gpu=gpu)
-    return [result for result in done.values() if result is not None]
+    return [*filter(None, done.values())]
