@@ -106,8 +106,6 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
                 verdict=verdict,
                 reason="made up",
                 open_sets=ambiguous,
-                baseline_fitted_rmse_rad=before,
-                identified_fitted_rmse_rad=after,
             ),
         ),
         families=tuple(families),

@@ -12,7 +12,7 @@ from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.gap.bench.hidden_finger import finger_of
 from vd.gap.bench.hidden_plant import HiddenPlant, Physics, PlantRun, simulate
-from vd.gap.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
+from vd.gap.bench.hide import COUPLING, NOISE_RAD, Hiding, reading_noise, simulate_hidden
 from vd.gap.bench.sizes import effect_at
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
@@ -75,10 +75,8 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
     monkeypatch.setattr("vd.gap.bench.hide.STAMP_JITTER_S", 0.0)
     exact = {"base_spread": 0.0, "excitations": ("gain_ladder",)}
     sizes = {name: effect_at(name, 3.0 if name in SMALL else 1.0) for name in names}
-    hidden = simulate_hidden(
-        [Hiding("servo", {name: sizes[name]}, seed=1, **exact) for name in names]
-    )
-    for name, made in zip(names, hidden, strict=True):
+    for name in names:
+        made = simulate_hidden(Hiding("servo", {name: sizes[name]}, seed=1, **exact))
         (chain,) = chains(made.recording)
         rows = np.stack([chain.start_row] * 2)
         for key, column in BASE.items():
@@ -127,12 +125,9 @@ def test_gears_ripple_and_noise_has_a_colour_but_no_other_size():
     geared = replace(servo(), physics=Physics(ripple_nm=0.2, ripple_per_turn=20.0))
     _, path = answer(geared, step)
     assert KP * (STEP - path[-1, 0]) == pytest.approx(-0.2 * np.sin(20 * path[-1, 0]), abs=1e-3)
-    white, coloured = (
-        _Session(Hiding("servo", physics=Physics(noise_s=noise_s)))._noise(
-            (9999, 1), np.arange(9999) * 0.01
-        )
-        for noise_s in (0.0, 0.02)
-    )
+    rng = np.random.default_rng(0)
+    time = np.arange(9999) * 0.01
+    white, coloured = (reading_noise(noise_s, (9999, 1), time, rng) for noise_s in (0.0, 0.02))
     for noise, memory in ((white, 0.0), (coloured, np.exp(-0.5))):
         assert noise.std() == pytest.approx(NOISE_RAD, rel=0.1)
         assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(memory, abs=0.05)
@@ -177,7 +172,7 @@ def test_a_finger_of_any_hand_moves_as_the_rollouts_say(tmp_path, monkeypatch):
     names = hand.joint_names[hand.fingers[1]]
     friction = {"coulomb_friction": {"tau_c_nm": 0.02}}
     exact = {"joints": names, "base_spread": 0.0, "excitations": ("torque_release",)}
-    (made,) = simulate_hidden([Hiding(str(hand.path), friction, seed=1, **exact)])
+    made = simulate_hidden(Hiding(str(hand.path), friction, seed=1, **exact))
     (chain,) = chains(made.recording, hand)
     rows = np.stack([chain.start_row] * 2)
     rows[0, :, kernel.COULOMB_TORQUE] = 0.02

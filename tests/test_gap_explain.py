@@ -29,7 +29,7 @@ STRIBECK = {servo.STRIBECK_STATIC: 0.13, servo.STRIBECK_SLIDING: 0.07, servo.STR
 
 def hidden(**effects: dict[str, float]) -> Recording:
     """A recording of the independent plant."""
-    (made,) = simulate_hidden([Hiding("servo", effects=effects, seed=11)])
+    made = simulate_hidden(Hiding("servo", effects=effects, seed=11))
     return made.recording
 
 

@@ -301,7 +301,7 @@ def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
         "encoder_bias": {"bias_rad": 0.3},
         "backlash": {"width_rad": 0.1},
     }
-    (hidden,) = simulate_hidden([Hiding("servo", effects=effects)])
+    hidden = simulate_hidden(Hiding("servo", effects=effects))
     read_recording(write_recording(hidden.recording, tmp_path / "r"))
 
 
@@ -332,7 +332,7 @@ def test_real_recordings_are_read(shared_dir, name, model, joints, trajectories)
 
 @pytest.fixture(scope="module")
 def machine():
-    (hidden,) = simulate_hidden([Hiding("servo", joints=("a", "b"))])
+    hidden = simulate_hidden(Hiding("servo", joints=("a", "b")))
     return hidden.recording
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vd.gap import rules
-from vd.gap.coordinates import GRAVITY, PARAMETERS
+from vd.gap.chain import relative_torques
+from vd.gap.coordinates import GRAVITY, PARAMETERS, values_of
 from vd.gap.fit import FINER, JointFit, JointSpec, Problems, intervals
 from vd.gap.result import (
     Alternative,
@@ -67,7 +68,7 @@ class AnalysedJoint:
         return self.conclusion.final
 
 
-def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
+def curves(problems: Problems, specs: Sequence[JointSpec], fits: Sequence[JointFit]) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad].
 
     NaN where no joint was fitted.
@@ -76,18 +77,22 @@ def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -
 
     Args:
         problems: Of the recording.
-        models: Problem and parameter rows of each fitted joint.
+        specs: The fitted joints.
+        fits: Their models.
     """
     recording = problems.recording
-    total = sum(len(t.time) for t in recording.trajectories)
-    result = np.full((total, len(recording.joints)), np.nan)
+    samples = sum(len(trajectory.time) for trajectory in recording.trajectories)
+    result = np.full((samples, len(recording.joints)), np.nan)
+    step = problems.dt / FINER[-1]
     for index, chain in enumerate(problems.chains):
-        own = {spec.joint: rows[spec.joint] for spec, rows in models if spec.chain == index}
-        if own:
-            rows = np.array([own.get(joint, row) for joint, row in enumerate(chain.start_row)])
-            rollouts = Rollouts(
-                chain, recording, dt=problems.dt / FINER[-1], device=problems.device
-            )
+        rows = chain.start_row.copy()
+        fitted = False
+        for spec, fit in zip(specs, fits, strict=True):
+            if spec.chain == index:
+                rows[spec.joint] = fit.rows[spec.joint]
+                fitted = True
+        if fitted:
+            rollouts = Rollouts(chain, recording, dt=step, device=problems.device)
             result[:, chain.columns] = rollouts.predict(rows[None])[0]
     return result
 
@@ -97,9 +102,10 @@ def assemble(
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
     recording = problems.recording
-    before = curves(problems, [(joint.spec, joint.plain.rows) for joint in joints])
-    after = curves(problems, [(joint.spec, joint.final.rows) for joint in joints])
     rng = np.random.default_rng(seed)
+    specs: list[JointSpec] = []
+    plain: list[JointFit] = []
+    final: list[JointFit] = []
     errors: list[TrajectoryError] = []
     gaps: list[JointGap] = []
     effects: list[NamedEffect] = []
@@ -108,8 +114,12 @@ def assemble(
     models: list[WholeModel] = []
     compared: list[WholeModel] = []
     credits: list[Credit] = []
+    not_tried: dict[str, dict[str, str]] = {}
     aside: dict[str, str] = {}
     for joint in joints:
+        specs.append(joint.spec)
+        plain.append(joint.plain)
+        final.append(joint.final)
         rows = _errors(joint, recording)
         errors += rows
         gaps.append(_gap(joint, rows, rng))
@@ -121,16 +131,20 @@ def assemble(
         models += every[: min(LISTED, len(joint.conclusion.good))]
         compared += every
         credits += _credits(joint)
+        not_tried[joint.name] = dict(joint.vetoes)
         if joint.spec.aside is not None:
             aside[joint.name] = recording.trajectories[joint.spec.aside].file
+    floors = np.array([gap.noise_floor_rad for gap in gaps])
+    before = curves(problems, specs, plain)
+    predictions = Predictions.of(recording, before, curves(problems, specs, final))
     report = Report(
-        verdict=rules.overall([joint.conclusion.verdict for joint in joints]),
-        noise_floor_rad=float(np.sqrt(np.mean([joint.spec.floor**2 for joint in joints]))),
-        baseline=_fit(joints, [joint.plain for joint in joints]),
+        verdict=rules.overall([gap.verdict for gap in gaps]),
+        noise_floor_rad=float(np.sqrt(np.mean(floors**2))),
+        baseline=_fitted(joints, plain),
         findings=tuple(findings),
         effects=tuple(effects),
         ambiguous=_sets(joints),
-        identified=_fit(joints, [joint.final for joint in joints]),
+        identified=_fitted(joints, final),
         held_out=_held_out(errors, rng),
         next_experiment="",
         seconds=np.nan,
@@ -139,9 +153,10 @@ def assemble(
             model=recording.model,
             joints=tuple(joint.name for joint in joints),
             trajectories=len(recording.trajectories),
-            samples=sum(len(t.time) for t in recording.trajectories),
-            seconds=float(sum(t.time[-1] for t in recording.trajectories)),
+            samples=len(predictions.time),
+            seconds=sum(trajectory.duration for trajectory in recording.trajectories),
             servo=str(recording.servo.get("model", "")),
+            relative_torques=relative_torques(recording),
         ),
         provisional=tuple(provisional),
         joints=tuple(gaps),
@@ -149,12 +164,12 @@ def assemble(
         models=tuple(models),
         compared=tuple(compared),
         credits=tuple(credits),
-        not_tried={joint.name: dict(joint.vetoes) for joint in joints},
+        not_tried=not_tried,
         trajectories=tuple(errors),
         aside=aside,
         seed=seed,
     )
-    return report, Predictions.of(recording, before, after)
+    return report, predictions
 
 
 def _errors(joint: AnalysedJoint, recording: Recording) -> list[TrajectoryError]:
@@ -179,16 +194,23 @@ def _errors(joint: AnalysedJoint, recording: Recording) -> list[TrajectoryError]
     return rows
 
 
-def _fit(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> FittedModel:
+def _fitted(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> FittedModel:
     """Errors of a model of each joint on what it was fitted to, and its baseline's parameters."""
-    count = sum(fit.count.sum() for fit in fits)
+    squares = 0.0
+    absolute = 0.0
+    count = 0.0
+    per_joint = {}
     parameters = {}
     for joint, fit in zip(joints, fits, strict=True):
+        squares += fit.sse.sum()
+        absolute += fit.absolute.sum()
+        count += fit.count.sum()
+        per_joint[joint.name] = fit.rmse
         parameters[joint.name] = _baseline_values(joint.spec, fit)
     return FittedModel(
-        rmse_rad=float(np.sqrt(sum(fit.sse.sum() for fit in fits) / count)),
-        per_joint={joint.name: fit.rmse for joint, fit in zip(joints, fits, strict=True)},
-        mae_rad=float(sum(fit.absolute.sum() for fit in fits) / count),
+        rmse_rad=float(np.sqrt(squares / count)),
+        per_joint=per_joint,
+        mae_rad=float(absolute / count),
         parameters=parameters,
     )
 
@@ -197,38 +219,38 @@ def _baseline_values(spec: JointSpec, fit: JointFit) -> dict[str, float]:
     """Parameters of the plain servo in a model."""
     row = fit.rows[spec.joint]
     names = ["kp", "kd", "velocity_limit"]
-    names += [name for name in ("inertia", "kd_off") if name in spec.baseline]
+    names += sorted({"inertia", "kd_off"}.intersection(spec.baseline))
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and row[GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)
-    return {name: float(row[PARAMETERS[name].column]) for name in names}
+    return values_of(row, names)
 
 
-def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Samples, and sums of squared errors of both models, of each trajectory [S]."""
-    count = np.array([row.samples for row in rows], float)
-    before = np.array([row.baseline_rmse_rad for row in rows])
-    after = np.array([row.identified_rmse_rad for row in rows])
-    return count, count * before**2, count * after**2
+def _table(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Samples [S], root-mean-square and mean absolute errors of both models [2, S] of trajectories."""
+    table = []
+    for row in rows:
+        squared = (row.baseline_rmse_rad, row.identified_rmse_rad)
+        table.append((row.samples, *squared, row.baseline_mae_rad, row.identified_mae_rad))
+    columns = np.array(table, float).T
+    return columns[0], columns[1:3], columns[3:]
 
 
 def _held_out(rows: Sequence[TrajectoryError], rng: np.random.Generator) -> HeldOut:
     """Errors before and after, over trajectories of all joints."""
-    count, old, new = _sums(rows)
-    weights = resamples(len(count), rng)
-    ratio = rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
-    before = float(rmse(old, count))
-    after = float(rmse(new, count))
-    baseline_mae = np.average([row.baseline_mae_rad for row in rows], weights=count)
-    identified_mae = np.average([row.identified_mae_rad for row in rows], weights=count)
+    count, errors, absolute = _table(rows)
+    sse = count * errors**2
+    old, new = rmse(sse, count, resamples(len(count), rng))
+    before, after = rmse(sse, count).tolist()
+    baseline_mae, identified_mae = np.average(absolute, axis=1, weights=count).tolist()
     return HeldOut(
         trajectories=tuple(dict.fromkeys(row.file for row in rows)),
         baseline_rmse_rad=before,
         identified_rmse_rad=after,
         reduction=1.0 - after / max(before, 1e-30),
-        ci95=interval(1.0 - ratio),
-        baseline_mae_rad=float(baseline_mae),
-        identified_mae_rad=float(identified_mae),
+        ci95=interval(1.0 - new / np.maximum(old, 1e-30)),
+        baseline_mae_rad=baseline_mae,
+        identified_mae_rad=identified_mae,
     )
 
 
@@ -236,22 +258,22 @@ def _gap(
     joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.Generator
 ) -> JointGap:
     """The errors of a joint, and what is concluded."""
-    count, old, new = _sums(rows)
-    weights = resamples(len(count), rng)
+    count, errors, _ = _table(rows)
+    sse = count * errors**2
+    old, new = rmse(sse, count, resamples(len(count), rng))
+    before, after = rmse(sse, count).tolist()
     conclusion = joint.conclusion
     answer = conclusion.verdict in ANSWERS
     return JointGap(
         joint=joint.name,
         noise_floor_rad=joint.spec.floor,
-        baseline_rmse_rad=float(rmse(old, count)),
-        baseline_ci95=interval(rmse(old, count, weights)),
-        identified_rmse_rad=float(rmse(new, count)),
-        identified_ci95=interval(rmse(new, count, weights)),
+        baseline_rmse_rad=before,
+        baseline_ci95=interval(old),
+        identified_rmse_rad=after,
+        identified_ci95=interval(new),
         verdict=conclusion.verdict,
         reason=conclusion.reason,
         open_sets=tuple(rules.open_sets(conclusion.good)) if answer else (),
-        baseline_fitted_rmse_rad=joint.plain.rmse,
-        identified_fitted_rmse_rad=joint.final.rmse,
     )
 
 
@@ -346,10 +368,9 @@ def _models(joint: AnalysedJoint) -> list[WholeModel]:
 
 def _credits(joint: AnalysedJoint) -> list[Credit]:
     """What each effect of a joint's delivered model brings, where the model without it was fitted."""
-    by_effects = {frozenset(fit.effects): fit for fit in joint.fits}
     rows = []
-    for name in joint.final.effects:
-        without = by_effects.get(frozenset(joint.final.effects) - {name})
-        if without is not None:
-            rows.append(Credit(joint.name, name, without.rmse, without.held_out_rmse))
-    return rows
+    for fit in joint.fits:
+        left_out = {*joint.final.effects}.difference(fit.effects)
+        if len(left_out) == 1 and len(fit.effects) == len(joint.final.effects) - 1:
+            rows.append(Credit(joint.name, left_out.pop(), fit.rmse, fit.held_out_rmse))
+    return sorted(rows, key=lambda row: joint.final.effects.index(row.effect))

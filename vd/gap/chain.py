@@ -107,8 +107,10 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
         ValueError: The recording is of a hand and none is given, it has joints that the hand has
             not, or joints follow others.
     """
-    gains = [t.conditions["p_gain"] for t in recording.trajectories if "p_gain" in t.conditions]
-    p_gain = max((float(gain) for gain in gains), default=None)
+    p_gain = None
+    for trajectory in recording.trajectories:
+        if (gain := trajectory.conditions.get("p_gain")) is not None:
+            p_gain = max(p_gain or 0.0, float(gain))
     if recording.model in BARE_MODELS:
         return [_bare(recording, column, p_gain) for column in range(len(recording.joints))]
     if hand is None:
@@ -127,9 +129,9 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
         )
     found = []
     for finger in hand.fingers:
-        names = tuple(name for name in hand.joint_names[finger] if name in recording.joints)
-        if names:
-            found.append(_finger(recording, hand, finger, names, p_gain))
+        joints = hand.joint_names[finger]
+        if not {*joints}.isdisjoint(recording.joints):
+            found.append(_finger(recording, hand, finger, p_gain))
     return found
 
 
@@ -153,10 +155,13 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     load = None
     if recording.model == "pendulum":
         free.append("tau_g_nm")
-        loads = filter(None, (load_of(t.conditions) for t in recording.trajectories))
-        if load := max(loads, key=lambda each: each.torque, default=None):
-            row[servo.GRAVITY_TORQUE] = load.torque
-            row[servo.INERTIA] += load.inertia
+        for trajectory in recording.trajectories:
+            own = load_of(trajectory.conditions)
+            if own and (load is None or own.torque > load.torque):
+                load = own
+    if load:
+        row[servo.GRAVITY_TORQUE] = load.torque
+        row[servo.INERTIA] += load.inertia
     return Chain(
         name=recording.joints[column],
         joints=(recording.joints[column],),
@@ -169,18 +174,19 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     )
 
 
-def _finger(
-    recording: Recording,
-    hand: HandModel,
-    finger: slice,
-    names: tuple[str, ...],
-    p_gain: float | None,
-) -> Chain:
+def _finger(recording: Recording, hand: HandModel, finger: slice, p_gain: float | None) -> Chain:
     """A finger's bodies with all joints at zero.
 
     What an unrecorded joint carries is fixed to its parent.
     """
-    slots = [i for i, name in enumerate(hand.joint_names[finger]) if name in names]
+    names = []
+    columns = []
+    slots = []
+    for slot, name in enumerate(hand.joint_names[finger]):
+        if name in recording.joints:
+            names.append(name)
+            columns.append(recording.joints.index(name))
+            slots.append(slot)
     joints = finger.start + np.array(slots)
     n = len(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
@@ -201,8 +207,9 @@ def _finger(
         mass[i] = masses.sum()
         centre = masses @ centres[links] / mass[i]
         com[i] = centre - origins[i]
-        for m, arm, about in zip(masses, centres[links] - centre, turned[links], strict=True):
-            inertia[i] += about + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        arms = centres[links] - centre
+        spread = masses * arms.T @ arms
+        inertia[i] = turned[links].sum(axis=0) + np.trace(spread) * np.eye(3) - spread
     rows = np.tile(neutral_row(), (n, 1))
     rows[:, servo.KP] = hand.kp[joints]
     rows[:, servo.KD] = hand.kd[joints]
@@ -210,8 +217,8 @@ def _finger(
     rows[:, servo.INERTIA] = hand.armature[joints]
     return Chain(
         name=names[0].partition("_")[0],
-        joints=names,
-        columns=np.array([recording.joints.index(name) for name in names]),
+        joints=tuple(names),
+        columns=np.array(columns),
         baseline_free=("kp", "kd", "velocity_limit"),
         start_row=rows,
         slot=np.array(slots),
@@ -245,11 +252,13 @@ def relative_torques(recording: Recording) -> bool:
 
     They have a unit of their own.
     """
-    loads = any(load_of(trajectory.conditions) for trajectory in recording.trajectories)
-    free = recording.model == "servo" or (recording.model in BARE_MODELS and not loads)
-    return free and any(known_stiffness(recording, joint) is None for joint in recording.joints)
+    if recording.model not in BARE_MODELS:
+        return False
+    if recording.model == "pendulum" and any(load_of(t.conditions) for t in recording.trajectories):
+        return False
+    return any(known_stiffness(recording, joint) is None for joint in recording.joints)
 
 
 def others_in(chain: Chain, joint: int) -> list[int]:
     """Slots of the other joints of a chain, whose motion can drive a joint."""
-    return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
+    return np.delete(chain.slot, joint).tolist()

@@ -90,11 +90,11 @@ def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
     for joint, finger, motor in zip(hand.joint_names, hand.joint_finger, hand.motors, strict=True):
         kind = None if motor is None else replace(motor, id=0, sign=1.0, offset_rad=0.0)
         like[joint] = joint.partition("_")[2], np.count_nonzero(hand.joint_finger == finger), kind
-    place = {like[joint]: joint for joint in reversed(known)}
-    others = {}
+    others: dict[str, str] = {}
     for joint in hand.joint_names:
-        if joint not in known and like[joint] in place:
-            others[joint] = place[like[joint]]
+        for own in () if joint in known else known:
+            if like[joint] == like[own]:
+                others.setdefault(joint, own)
     return others
 
 
@@ -108,16 +108,22 @@ def _effects(
     values: dict[str, dict[str, Any]] = {}
     if joint in start:
         for named in EFFECTS.values():
-            row = {p.name: float(start[joint][p.column]) for p in named.parameters}
-            if any(row[p.name] != p.neutral for p in named.parameters):
+            row = {}
+            acts = False
+            for p in named.parameters:
+                row[p.name] = float(start[joint][p.column])
+                acts = acts or row[p.name] != p.neutral
+            if acts:
                 values[named.name] = row
     if GRAVITY.name in fitted:
         values.setdefault("gravity_load", {})[GRAVITY.name] = fitted[GRAVITY.name]
     for effect in held:
-        for key, one in effect.parameters.items() if joint in effect.joints else ():
-            low, high = one.ci95
-            certain = -np.inf < low <= one.value <= high < np.inf
-            known = (one.value, low, high) if certain else one.value
+        if joint not in effect.joints:
+            continue
+        for key, number in effect.parameters.items():
+            low, high = number.ci95
+            certain = -np.inf < low <= number.value <= high < np.inf
+            known = (number.value, low, high) if certain else number.value
             values.setdefault(effect.name, {})[key] = known
     return values
 
@@ -153,12 +159,14 @@ def simulate_again(
         models = _newton(report, layer, recording, hand_name, start_layer, device)
     models = np.where(np.isnan(curves.baseline), np.nan, models)
     curves = replace(curves, baseline=models[0], identified=models[1])
-    fitted = {}
+    fitted = []
+    per_joint = {}
     for joint in report.identified.per_joint:
         files = [row.file for row in report.trajectories if row.joint == joint]
-        fitted[joint] = _squares(curves, joint, files)
-    before, after = _rms([*fitted.values()])
-    per_joint = {joint: _rms([squares]) for joint, squares in fitted.items()}
+        squares = _squares(curves, joint, files)
+        fitted.append(squares)
+        per_joint[joint] = _rms([squares])
+    before, after = _rms(fitted)
     simulator: Literal["newton", "rollout"] = "rollout" if hand_name is None else "newton"
     closing = Closing(simulator, layer.name, before, after, per_joint)
     delivered = None
@@ -171,7 +179,7 @@ def simulate_again(
 
 def _squares(curves: Predictions, joint: str, files: Sequence[str]) -> np.ndarray:
     """Squared errors of baseline and identified model on a joint in some trajectories [2, N]."""
-    rows = np.isin(curves.trajectory, [curves.files.index(file) for file in files])
+    rows = np.isin(curves.trajectory, [*map(curves.files.index, files)])
     column = curves.joints.index(joint)
     models = np.stack([curves.baseline[rows, column], curves.identified[rows, column]])
     return (models - curves.measured[rows, column]) ** 2
@@ -216,7 +224,6 @@ def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -
     for chain in chains(recording, None):
         if np.isfinite(curves.identified[:, chain.columns]).any():
             rows, _ = read_bare_layer(layer, chain.joints)
-            after[:, chain.columns] = Rollouts(chain, recording, device=device).predict(rows[None])[
-                0
-            ]
+            rollouts = Rollouts(chain, recording, device=device)
+            after[:, chain.columns] = rollouts.predict(rows[None])[0]
     return after

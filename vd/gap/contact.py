@@ -21,6 +21,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial.polynomial import polyfit
+from scipy.ndimage import find_objects, label
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
@@ -35,6 +37,8 @@ FALSE_NAMES = 0.02
 """Share of recordings without a gap in which any name may be given; split evenly over all
 numbers.
 """
+NUMBERS = sum(len(parameter.nominal) for parameter in CONTACT.values())
+"""Of all parameters, which together may give a false name in that share of recordings."""
 OUTLIER = 3.5
 """Residuals beyond this many standard deviations, by the median, are samples that came late."""
 FEWEST = 5
@@ -133,8 +137,8 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
         RecordingError: Objects do not fall by g along -z: another frame, unit or clock.
     """
     points = np.unique(np.concatenate([vertices for vertices, _ in item.hulls]), axis=0)
-    heights = [_lowest(motion, points) for motion in recording.motions]
-    state = _State(points, float(np.median([np.percentile(height, 5) for height in heights])))
+    heights = [np.percentile(_lowest(motion, points), 5) for motion in recording.motions]
+    state = _State(points, float(np.median(heights)))
     _check_gravity(recording, state)
 
     def equations(
@@ -148,24 +152,28 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Con
                 result.append((np.sum(grams, axis=0), np.sum(slopes, axis=0)))
         return result
 
-    found = {}
-    found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
+    centre = _judge("centre_of_mass", equations("drop", _flights), item)
     if centre.verdict == "effect":  # impacts need it
         state.centre = centre.value
     # What is known within bounds only widens an interval by what it does to the estimate.
-    bounces = []
-    for state.unseen in (0.0, 1.0, 0.5):
-        bounces.append(equations("drop", _impacts))
-    spread = np.abs(_estimate(bounces[1], 1)[0] - _estimate(bounces[0], 1)[0]) / math.sqrt(12.0)
-    found["restitution"] = _judge("restitution", bounces[2], item, spread)
-    found["table_friction"] = friction = _judge("table_friction", equations("slide", _slides), item)
-    pushes = []
-    for (state.friction,) in (friction.low, friction.high, friction.value):
-        pushes.append(equations("push", _pushes))
-    spread = np.abs(_estimate(pushes[1], 1)[0] - _estimate(pushes[0], 1)[0]) / 4.0
-    found["mass"] = _judge("mass", pushes[2], item, spread)
-    found["tip_compliance"] = _judge("tip_compliance", equations("press", _presses), item)
-    return [found[name] for name in CONTACT]
+    state.unseen = 0.0
+    least, _ = _estimate(equations("drop", _impacts), 1)
+    state.unseen = 1.0
+    most, _ = _estimate(equations("drop", _impacts), 1)
+    state.unseen = 0.5
+    spread = np.abs(most - least) / math.sqrt(12.0)
+    restitution = _judge("restitution", equations("drop", _impacts), item, spread)
+    friction = _judge("table_friction", equations("slide", _slides), item)
+    state.friction = float(friction.low[0])
+    least, _ = _estimate(equations("push", _pushes), 1)
+    state.friction = float(friction.high[0])
+    most, _ = _estimate(equations("push", _pushes), 1)
+    state.friction = float(friction.value[0])
+    spread = np.abs(most - least) / 4.0
+    mass = _judge("mass", equations("push", _pushes), item, spread)
+    compliance = _judge("tip_compliance", equations("press", _presses), item)
+    found = [friction, restitution, mass, centre, compliance]
+    return sorted(found, key=lambda each: [*CONTACT].index(each.name))
 
 
 def verdict(found: Sequence[ContactEstimate]) -> Literal["effects", "no_gap", "under_excited"]:
@@ -193,9 +201,7 @@ def _judge(
     value, deviation = _estimate(motions, len(nominal))
     deviation = np.hypot(deviation, besides)
     freedom = max(len(motions) - 1, 1)
-    # All numbers of all parameters together may give a false name in FALSE_NAMES of recordings.
-    numbers = sum(len(p.nominal) for p in CONTACT.values())
-    half = student.ppf(1.0 - 0.5 * FALSE_NAMES / numbers, freedom) * deviation
+    half = student.ppf(1.0 - 0.5 * FALSE_NAMES / NUMBERS, freedom) * deviation
     gap = np.abs(value - nominal)
     least = np.maximum(half, resolution)
     told = bool(np.isfinite(deviation).all())
@@ -228,7 +234,7 @@ def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarr
     blank = np.full(size, np.nan)
     if count < 3:
         return blank, blank
-    gram, slope = (np.array(arrays) for arrays in zip(*motions, strict=True))
+    gram, slope = map(np.array, zip(*motions, strict=True))
     try:
         value = np.linalg.solve(gram.sum(0), slope.sum(0))
         others = np.linalg.solve(gram.sum(0) - gram, (slope.sum(0) - slope)[..., None])[..., 0]
@@ -255,31 +261,38 @@ def _lowest(motion: ContactMotion, points: np.ndarray) -> np.ndarray:
     return motion.position[:, 2] + (motion.rotation.as_matrix()[:, 2] @ points.T).min(1)
 
 
-def _velocity(motion: ContactMotion) -> np.ndarray:
-    """Horizontal velocity [T, 2] by parabolas through :data:`SMOOTH_S` of evenly spaced samples."""
+def _step(motion: ContactMotion) -> float:
+    """Usual time between two samples [s]."""
+    return float(np.median(np.diff(motion.time)))
+
+
+def _velocity(motion: ContactMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal velocity [T, 2] and its size [T], by parabolas through :data:`SMOOTH_S`."""
     time = motion.time
-    step = float(np.median(np.diff(time)))
+    step = _step(motion)
     even = np.arange(time[0], time[-1] + step, step)
     window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
-    columns = []
-    for values in motion.position.T[:2]:
-        smooth = savgol_filter(np.interp(even, time, values), window, 2, deriv=1, delta=step)
-        columns.append(np.interp(time, even, smooth))
-    return np.stack(columns, axis=1)
+    velocity = np.empty((len(time), 2))
+    for axis in range(2):
+        position = np.interp(even, time, motion.position[:, axis])
+        smooth = savgol_filter(position, window, 2, deriv=1, delta=step)
+        velocity[:, axis] = np.interp(time, even, smooth)
+    return velocity, np.linalg.norm(velocity, axis=1)
 
 
 def _stretches(mask: np.ndarray) -> Iterator[slice]:
     """Runs of true samples, long enough to be evidence."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    for first, end in zip(edges[::2], edges[1::2], strict=True):
-        if end - first >= FEWEST:
-            yield slice(int(first), int(end))
+    for (part,) in find_objects(label(mask)[0]):
+        if part.stop - part.start >= FEWEST:
+            yield part
 
 
 def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
     """Stretches in which nothing touches the object."""
     found = list(_stretches(_lowest(motion, state.points) > state.table_m + CLEAR_M))
-    return [_released(motion, part) if i == 0 else part for i, part in enumerate(found)]
+    if found:
+        found[0] = _released(motion, found[0])
+    return found
 
 
 def _released(motion: ContactMotion, part: slice) -> slice:
@@ -318,7 +331,9 @@ def _check_gravity(recording: ContactRecording, state: _State) -> None:
     """Refuse drops that do not fall as things do."""
     falls = []
     for motion in recording.motions:
-        for part in _in_flight(motion, state) if motion.kind == "drop" else ():
+        if motion.kind != "drop":
+            continue
+        for part in _in_flight(motion, state):
             time = motion.time[part] - motion.time[part].mean()
             if np.ptp(time) > SURE_S:
                 falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
@@ -344,8 +359,7 @@ def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
 def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Path along the direction of a slide = s0 + v t - mu g t^2 / 2."""
     time = motion.time
-    velocity = _velocity(motion)
-    speed = np.linalg.norm(velocity, axis=1)
+    velocity, speed = _velocity(motion)
     free = (time > time[speed.argmax()] + SMOOTH_S) & (speed > SLIDING * speed.max())
     for part in _stretches(free & _flat_on_table(motion, state)):
         since = time[part] - time[part].mean()
@@ -367,11 +381,9 @@ def _flat_on_table(motion: ContactMotion, state: _State) -> np.ndarray:
 def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Speed of the touching points after an impact = e times before."""
     flights = _in_flight(motion, state)
-    step = float(np.median(np.diff(motion.time)))
     # Of the fastest bounce with too few samples above CLEAR_M.
-    unseen = math.sqrt(
-        2.0 * GRAVITY_M_S2 * (CLEAR_M + GRAVITY_M_S2 * (0.5 * FEWEST * step) ** 2 / 2.0)
-    )
+    fall = 0.5 * GRAVITY_M_S2 * (0.5 * FEWEST * _step(motion)) ** 2
+    unseen = math.sqrt(2.0 * GRAVITY_M_S2 * (CLEAR_M + fall))
     for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
             return
@@ -400,40 +412,33 @@ def _touch(
     edge = -1 if touching is None else 0
     since = time - time[edge]
     centre = motion.position[part] + motion.rotation[part].apply(state.centre)
-    height, rise = np.polynomial.polynomial.polyfit(
-        since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1
-    )
+    height, rise = polyfit(since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1)
     near = np.abs(since) < SMOOTH_S
     base = motion.rotation[part][edge]
     turned = (motion.rotation[part][near] * base.inv()).as_rotvec()
-    turn, spin = np.polynomial.polynomial.polyfit(since[near], turned, 1)
+    turn, spin = polyfit(since[near], turned, 1)
     times = np.linspace(-0.5 * SMOOTH_S, 0.5 * SMOOTH_S, 501)
     turns = (Rotation.from_rotvec(turn + times[:, None] * spin) * base).as_matrix()
     arms = turns @ (state.points - state.centre).T  # [501, 3, N]
     above = height + rise * times - 0.5 * GRAVITY_M_S2 * times**2 - state.table_m
     if touching is None:
-        first = int(np.abs(above + arms[:, 2].min(1)).argmin())
-        touching = arms[first, 2] < arms[first, 2].min() + FLAT_M
-    at = int(np.abs(above + arms[:, 2, touching].mean(1)).argmin())
-    arm = arms[at][:, touching].mean(1)
-    return (
-        time[edge] + times[at],
-        rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arm)[2],
-        touching,
-    )
+        first = arms[np.abs(above + arms[:, 2].min(1)).argmin(), 2]
+        touching = first < first.min() + FLAT_M
+    arms = arms[:, :, touching].mean(2)
+    at = np.abs(above + arms[:, 2]).argmin()
+    speed = rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arms[at])[2]
+    return time[edge] + times[at], speed, touching
 
 
 def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
-    velocity = _velocity(motion)
-    speed = np.linalg.norm(velocity, axis=1)
+    velocity, speed = _velocity(motion)
     pressing = np.linalg.norm(motion.force, axis=1) > PRESSED_N
     sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
-    margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
+    margin = round(SMOOTH_S / _step(motion))
     for whole in _stretches(sliding):
-        part = slice(
-            whole.start + margin, whole.stop - margin
-        )  # velocities at the ends are of other motions too
+        # Velocities at the ends are of other motions too.
+        part = slice(whole.start + margin, whole.stop - margin)
         time = motion.time[part]
         ahead = velocity[part] / speed[part, None]
         if len(time) >= FEWEST:

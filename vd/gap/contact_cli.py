@@ -84,7 +84,7 @@ def identified(found: "Sequence[ContactEstimate]") -> dict[str, tuple[tuple[floa
         low = each.low
         if len(low) == 1:  # a coarse interval may reach below zero, which cannot be simulated
             low = np.maximum(low, 0.1 * each.value)
-        result[each.name] = tuple(tuple(v.tolist()) for v in (each.value, low, each.high))
+        result[each.name] = tuple(map(tuple, np.stack([each.value, low, each.high]).tolist()))
     return result
 
 
@@ -154,7 +154,7 @@ class HideContact:
         from vd.gap.bench.hide import check_hidden, truth_path
 
         check_hidden(self.out)
-        values = dict(_parse(text) for text in self.hide)
+        values = dict(map(_parse, self.hide))
         hide_contact(ContactPlant(load_set(self.object)[0], values, seed=self.seed), self.out)
         print(f"{self.out}\n{truth_path(self.out)}")
         return 0
@@ -168,7 +168,7 @@ def _parse(text: str) -> tuple[str, Any]:
     if name not in CONTACT:
         raise ValueError(f"--hide {text}: there is no {name!r}; choose from {', '.join(CONTACT)}")
     try:
-        numbers = tuple(float(part) for part in value.split(","))
+        numbers = tuple(map(float, value.split(",")))
     except ValueError:
         numbers = ()
     if len(numbers) != len(CONTACT[name].nominal):

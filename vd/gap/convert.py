@@ -96,17 +96,19 @@ def convert(asked: Convert) -> Recording:
         )
     joints = asked.joints or motions[0].joints
     resolution = 2.0 * math.pi / asked.counts_per_turn
-    trajectories = tuple(
-        _trajectory(asked, one, joints, MIN_SAMPLES * resolution) for one in motions
-    )
-    for one in trajectories:
-        if (asked.out / one.file).exists():
+    trajectories = []
+    for motion in motions:
+        trajectory = _trajectory(asked, motion, joints, MIN_SAMPLES * resolution)
+        if (asked.out / trajectory.file).exists():
             raise ValueError(
-                f"--out {asked.out} holds {one.file}, which would be lost; name another folder"
+                f"--out {asked.out} holds {trajectory.file}, which would be lost; "
+                "name another folder"
             )
+        trajectories.append(trajectory)
     model = asked.model or ("pendulum" if format == "bam" else "servo")
     with TemporaryDirectory() as work:
-        write_recording(Recording(Path(work), model, joints, {}, resolution, trajectories), work)
+        made = Recording(Path(work), model, joints, {}, resolution, tuple(trajectories))
+        write_recording(made, work)
         try:
             recording = read_recording(work)  # every check
         except RecordingError as error:
@@ -124,7 +126,7 @@ def _trajectory(
         if joint not in motion.joints:
             there = ", ".join(motion.joints)
             raise RecordingError(f"{where}: no joint {joint!r}; there are {there}")
-    picked = [motion.joints.index(joint) for joint in joints]
+    picked = [*map(motion.joints.index, joints)]
     channels: dict[str, Any] = {}
     for name, values in motion.channels.items():
         if name not in asked.drop and not np.isnan(values[:, picked]).all():

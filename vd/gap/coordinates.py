@@ -1,7 +1,7 @@
 """Coordinates in which the servo model is fitted, and sizes at which the search for an effect starts."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +13,8 @@ GRAVITY, _ = EFFECTS["gravity_load"].parameters
 PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
 """Everything that can be fitted, by key: ``kp`` of a baseline, ``effect.parameter`` of effects."""
 for _effect in EFFECTS.values():
-    PARAMETERS |= {
-        f"{_effect.name}.{parameter.name}": parameter for parameter in _effect.parameters
-    }
+    for _parameter in _effect.parameters:
+        PARAMETERS[f"{_effect.name}.{_parameter.name}"] = _parameter
 
 LOG_STEP = 0.01
 """Finite-difference step of a logarithmic coordinate: above the noise of single precision. Not
@@ -169,6 +168,11 @@ def keys_of(effects: Collection[str]) -> list[str]:
     return [key for key in PARAMETERS if key.rpartition(".")[0] in effects]
 
 
+def values_of(row: np.ndarray, keys: Iterable[str]) -> dict[str, float]:
+    """Values of some parameters in a row [PARAMETER_COLUMNS], by key."""
+    return {key: float(row[PARAMETERS[key].column]) for key in keys}
+
+
 def _scale(parameter: Parameter, scales: Scales) -> float:
     if parameter.unit == "N m":
         return max(0.3 * scales.torque, 1e-4)
@@ -196,7 +200,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         scales: Sizes of the joint's motion.
     """
     if effect == "joint_coupling":
-        blank = {f"{effect}.from_{slot + 1}": 0.0 for slot in others}
+        blank = dict.fromkeys([f"{effect}.from_{slot + 1}" for slot in others], 0.0)
         return [{**blank, key: factor} for key in blank for factor in (0.05, -0.05)]
     period = EFFECTS["command_delay"].parameters[0].typical
     units = {
@@ -215,9 +219,10 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         inside = np.clip(values, PARAMETERS[key].lower, PARAMETERS[key].upper)
         columns.append(np.where(values > 0.0, inside, values))
     starts = [dict(zip(names, row, strict=True)) for row in np.transpose(columns).tolist()]
+    also = {}
     if effect in SLOWING:
         # The baseline's speed limit took the effect's place: let go of it as well.
-        starts += [{**start, "velocity_limit": FREE_SPEED * scales.speed} for start in starts]
+        also["velocity_limit"] = FREE_SPEED * scales.speed
     if effect in SMOOTHING:
-        starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
-    return starts
+        also["inertia"] = LIGHT * scales.inertia
+    return starts + [start | also for start in starts if also]

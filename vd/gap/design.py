@@ -40,38 +40,51 @@ def design(
     Returns:
         ``(trajectories, folds, aside)``, empty and None for a joint that nothing excites.
     """
-    name = chain.joints[joint]
     column = int(chain.columns[joint])
-    moving = []
-    for i, trajectory in enumerate(recording.trajectories):
-        if name in trajectory.joints and np.ptp(trajectory.command[:, column]) > 0.0:
-            moving.append(i)
-    if not moving:
+    own = _moving(recording, chain, joint)
+    if not own:
         return (), (), None
-    spread = np.linspace(0, len(moving) - 1, MAX_MOTIONS).round().astype(int)
-    own = [moving[i] for i in np.unique(spread)]
+    spread = np.linspace(0, len(own) - 1, MAX_MOTIONS).round().astype(int)
+    own = [own[i] for i in np.unique(spread)]
     aside = None
     if len(own) >= ENOUGH:
-        sizes = [np.ptp(recording.trajectories[i].command[:, column]) for i in own]
-        aside = own.pop(int(np.argsort(sizes, kind="stable")[len(own) // 2]))
-    chosen = set(own)
-    for other in range(len(chain.joints)):
-        if other != joint:
-            size = {}
-            for i, t in enumerate(recording.trajectories):
-                if t.joints == (chain.joints[other],):
-                    size[i] = np.ptp(t.command[:, chain.columns[other]])
-            chosen |= set(sorted(size, key=lambda i: -size[i])[:BYSTANDERS])
-    trajectories = sorted(chosen)
+        ranked = sorted(own, key=lambda i: np.ptp(recording.trajectories[i].command[:, column]))
+        aside = ranked[len(own) // 2]
+        own.remove(aside)
+    trajectories = sorted({*own, *_bystanders(recording, chain, joint)})
     condition = varied([recording.trajectories[i] for i in own])
-    parts = [recording.trajectories[i] for i in trajectories]
-    labels = [str(t.conditions.get(condition)) if condition else t.excitation for t in parts]
-    kinds = sorted(set(labels))
+    labels = []
+    for i in trajectories:
+        trajectory = recording.trajectories[i]
+        value = trajectory.conditions.get(condition) if condition else trajectory.excitation
+        labels.append(str(value))
+    kinds = sorted({*labels})
     if len(kinds) < 2:
-        labels = [str(i) for i in trajectories]
-        kinds = [str(i) for i in trajectories]
+        kinds = labels = [*map(str, trajectories)]
     folds = tuple(kinds.index(label) % MAX_FOLDS for label in labels)
     return tuple(trajectories), folds, aside
+
+
+def _moving(recording: Recording, chain: Chain, joint: int) -> list[int]:
+    """Trajectories that excite a joint."""
+    result = []
+    for i, trajectory in enumerate(recording.trajectories):
+        command = trajectory.command[:, chain.columns[joint]]
+        if chain.joints[joint] in trajectory.joints and np.ptp(command) > 0.0:
+            result.append(i)
+    return result
+
+
+def _bystanders(recording: Recording, chain: Chain, joint: int) -> list[int]:
+    """Trajectories of the largest motions of each other joint alone."""
+    result: list[int] = []
+    for other, column in enumerate(chain.columns):
+        size = {}
+        for i, trajectory in enumerate(recording.trajectories):
+            if other != joint and trajectory.joints == (chain.joints[other],):
+                size[i] = -np.ptp(trajectory.command[:, column])
+        result += sorted(size, key=size.__getitem__)[:BYSTANDERS]
+    return result
 
 
 def pieces(
@@ -84,17 +97,14 @@ def pieces(
     Different motions say more than long ones: of a long recording, a piece of every trajectory, the
     one that covers the widest range of those that begin at rest, as a simulation must.
     """
-    lengths = np.array([recording.trajectories[i].time[-1] for i in trajectories])
-    if lengths.sum() <= MAX_MOTION_S:
-        return ()
+    chosen = [recording.trajectories[i] for i in trajectories]
     left = MAX_MOTION_S
-    share = 0.0
-    for done, length in enumerate(np.sort(lengths)):
-        share = left / (len(lengths) - done)
-        if length > share:
-            break
-        left -= length
-    return tuple(_widest(recording, chain, recording.trajectories[i], share) for i in trajectories)
+    for done, trajectory in enumerate(sorted(chosen, key=lambda t: t.duration)):
+        share = left / (len(chosen) - done)
+        if trajectory.duration > share:
+            return tuple(_widest(recording, chain, each, share) for each in chosen)
+        left -= trajectory.duration
+    return ()
 
 
 def _widest(
@@ -104,16 +114,15 @@ def _widest(
     time = trajectory.time
     if time[-1] <= share:
         return 0, len(time)
-    columns = [int(column) for column in chain.columns]
-    rest = np.logical_and.reduce(
-        [held(trajectory, c, recording.encoder_resolution_rad) for c in columns]
-    )
+    rest = np.ones(len(time), bool)
+    for column in chain.columns:
+        rest &= held(trajectory, int(column), recording.encoder_resolution_rad)
     rest[0] = True
     starts = np.flatnonzero(rest & (time <= time[-1] - share))
     ends = np.searchsorted(time, time[starts] + share)
-    position = trajectory.position[:, columns]
-    parts = zip(starts, ends, strict=True)
-    covered = np.array([np.ptp(position[first:end], axis=0).sum() for first, end in parts])
+    covered = np.zeros(len(starts))
+    for k, (first, end) in enumerate(zip(starts, ends, strict=True)):
+        covered[k] = np.ptp(trajectory.position[first:end, chain.columns], axis=0).sum()
     best = int(np.argmax(covered >= NEARLY * covered.max()))
     return int(starts[best]), int(ends[best])
 

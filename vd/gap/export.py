@@ -37,6 +37,25 @@ TERMS = {
     "phase": ("gravity_load.phase_rad",),
 }
 """What other programs have of a servo, by their names: sums of our parameters."""
+MODEL = f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="{STEP_S}" integrator="implicitfast" gravity="0 0 -{GRAVITY_M_S2}"/>
+  <worldbody>{{}}</worldbody>
+  <actuator>{{}}</actuator>
+</mujoco>
+"""
+BODY = f"""
+    <body name="{{name}}">
+      <inertial pos="{{x}} 0 {{z}}" mass="{{mass}}" diaginertia="1e-12 1e-12 1e-12"/>
+      <joint name="{{name}}" axis="0 1 0" armature="{{armature}}" frictionloss="{{friction}}"
+             solimpfriction="{STIFF} {STIFF}" solreffriction="{2.0 * STEP_S} 1"/>
+    </body>
+"""
+ACTUATOR = """
+    <position name="{name}" joint="{name}" kp="{stiffness}" kv="{damping}" delay="{delay}"
+              nsample="{samples}"/>
+"""
 COMMON = ("stiffness", "damping", "effort_limit", "armature")
 LABS = {
     "mjlab": (
@@ -77,8 +96,9 @@ def _write(path: Path, comment: str, text: str, joints: "list[JointModel]") -> N
     """Write a file with what it lacks at its head, and say that."""
     lost = []
     for joint in joints:
-        left = sorted(joint.numbers.keys() - joint.taken)
-        lost += [f"{joint.name} lacks {key} = {joint.numbers[key][0]:.4g}" for key in left]
+        for key in sorted(joint.numbers.keys() - joint.taken):
+            value = joint.numbers[key][0]
+            lost.append(f"{joint.name} lacks {key} = {value:.4g}")
         joint.taken.clear()
     head = "".join(map(comment.format, ["Identified by vd-gap.", *lost]))
     write_text(path, head + text)
@@ -117,7 +137,7 @@ def read_joints(layer: Path, hand: str | None) -> list[JointModel]:
         rows, intervals = read_bare_layer(layer, names)
     else:
         model = load_hand(hand, layer=layer)
-        index = [model.joint_names.index(name) for name in names]
+        index = [*map(model.joint_names.index, names)]
         rows = model.servo[index]
         intervals = model.servo_interval[index]
     joints = []
@@ -132,36 +152,30 @@ def read_joints(layer: Path, hand: str | None) -> list[JointModel]:
 
 def mjcf(joints: list[JointModel]) -> str:
     """A pendulum for each joint as MJCF, with all that it weighs."""
-    spec = mujoco.MjSpec()
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.timestep = STEP_S
-    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
+    bodies = ""
+    actuators = ""
     for joint in joints:
-        values = {term: joint.take(term)[0] for term in TERMS if term != "velocity_limit_sim"}
+        values = {}
+        for term in TERMS:
+            if term != "velocity_limit_sim":
+                values[term] = joint.take(term)[0]
         # A point mass that has both the weight and the inertia.
         pull = values["weight"] / GRAVITY_M_S2
         mass = pull**2 / max(values["armature"], 1e-9) + 1e-9
         arm = pull / mass
-        place = [-arm * math.sin(values["phase"]), 0.0, -arm * math.cos(values["phase"])]
-        point = {"mass": mass, "ipos": place, "inertia": [1e-12] * 3, "explicitinertial": True}
-        spec.worldbody.add_body(name=joint.name, **point).add_joint(
-            name=joint.name,
-            axis=[0.0, 1.0, 0.0],
-            armature=max(values["armature"] - mass * arm**2, 0.0),
-            frictionloss=values["friction"],
-            solimp_friction=[STIFF, STIFF, 0.001, 0.5, 2.0],
-            solref_friction=[2.0 * STEP_S, 1.0],
-        )
-        drive = spec.add_actuator(name=joint.name, target=joint.name)
-        drive.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        smoothed = values["filter"] or -1.0
-        drive.set_to_position(values["stiffness"], values["damping"], timeconst=smoothed)
-        if limit := values["effort_limit"]:
-            drive.forcerange = [-limit, limit]
-        drive.delay = values["delay"]
-        drive.nsample = math.ceil(values["delay"] / STEP_S) + 1
-    spec.compile()
-    return spec.to_xml()
+        values["armature"] = max(values["armature"] - mass * arm**2, 0.0)
+        x = -arm * math.sin(values["phase"])
+        z = -arm * math.cos(values["phase"])
+        bodies += BODY.format(name=joint.name, x=x, z=z, mass=mass, **values)
+        samples = math.ceil(values["delay"] / STEP_S) + 1
+        more = ""
+        if values["filter"]:
+            more += ' timeconst="{filter}"'
+        if values["effort_limit"]:
+            more += ' forcerange="-{effort_limit} {effort_limit}"'
+        drive = ACTUATOR.replace("/>", more + "/>")
+        actuators += drive.format(name=joint.name, samples=samples, **values)
+    return mujoco.MjSpec.from_string(MODEL.format(bodies, actuators)).to_xml()
 
 
 def actuators(lab: str, joints: list[JointModel], step: float) -> str:
@@ -200,7 +214,9 @@ def into_hand(layer: Path, joints: list[JointModel], hand: str, path: Path) -> N
         if effect and effect not in RIG:
             effects.setdefault(effect, {})[name] = known[np.isfinite(known)].tolist()
     model = load_hand(hand)
-    drive = {key: float(numbers[key][0]) for key in ("kp", "kd", "velocity_limit")}
+    drive = {}
+    for key in ("kp", "kd", "velocity_limit"):
+        drive[key] = float(numbers[key][0])
     baseline = dict.fromkeys(model.joint_names, drive)
     everywhere = dict.fromkeys(model.joint_names, effects)
     tool = "vd-gap export"

@@ -30,8 +30,15 @@ def gap_figure(report: Report) -> Figure:
     figure = Figure(figsize=(9.0, 1.2 + 0.5 * max(len(joints), 2)), layout="constrained")
     axes = figure.add_subplot()
     places = -np.arange(len(joints))
-    before = [(joint.baseline_rmse_rad, *joint.baseline_ci95) for joint in joints]
-    after = [(joint.identified_rmse_rad, *joint.identified_ci95) for joint in joints]
+    names = []
+    floors = []
+    before = []
+    after = []
+    for joint in joints:
+        names.append(joint.joint)
+        floors.append(1e3 * joint.noise_floor_rad)
+        before.append((joint.baseline_rmse_rad, *joint.baseline_ci95))
+        after.append((joint.identified_rmse_rad, *joint.identified_ci95))
     models = (
         ("before: the plain servo model", ORANGE, before),
         ("after: the identified model", GREEN, after),
@@ -44,9 +51,8 @@ def gap_figure(report: Report) -> Figure:
             axes.text(
                 np.nanmax([value, high]), place + side, f"  {value:.3g}", va="center", fontsize=8
             )
-    floors = [1e3 * joint.noise_floor_rad for joint in joints]
     axes.vlines(floors, places - 0.4, places + 0.4, color=BLUE, linewidth=2.0, label="noise floor")
-    axes.set_yticks(places, [joint.joint for joint in joints])
+    axes.set_yticks(places, names)
     axes.set_xlim(left=0.0)
     axes.margins(x=0.08)
     axes.set_xlabel("root-mean-square error on held-out motions [mrad], with 95 % intervals")
@@ -95,8 +101,10 @@ def residual_figure(report: Report, curves: Predictions, joint: str) -> Figure:
     """
     column = curves.joints.index(joint)
     measured = curves.measured[:, column]
-    parts = [curves.trajectory == index for index in range(len(curves.files))]
-    speed = np.concatenate([np.gradient(measured[rows], curves.time[rows]) for rows in parts])
+    speed = np.empty(len(measured))
+    for index in range(len(curves.files)):
+        rows = curves.trajectory == index
+        speed[rows] = np.gradient(measured[rows], curves.time[rows])
     quantities = {
         "time in the motion [s]": curves.time,
         "measured speed [rad/s]": speed,

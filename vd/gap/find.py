@@ -71,17 +71,19 @@ def findings(
         predicted: The baseline's positions of all trajectories, one after the other [S, J] [rad].
         floors: Noise floor of each joint that was fitted [rad].
     """
-    ends = np.cumsum([len(t.time) for t in recording.trajectories])[:-1]
-    parts = list(zip(recording.trajectories, np.split(predicted, ends), strict=True))
     found = []
     for column, name in enumerate(recording.joints):
-        if name in floors:
-            own = []
-            for trajectory, simulated in parts:
-                if name in trajectory.joints:
-                    left = trajectory.position[:, column] - simulated[:, column]
-                    own.append((trajectory, left))
-            found += _joint(name, own, column, recording.encoder_resolution_rad, floors[name])
+        if name not in floors:
+            continue
+        own = []
+        end = 0
+        for trajectory in recording.trajectories:
+            first = end
+            end += len(trajectory.time)
+            if name in trajectory.joints:
+                left = trajectory.position[:, column] - predicted[first:end, column]
+                own.append((trajectory, left))
+        found += _joint(name, own, column, recording.encoder_resolution_rad, floors[name])
     return found
 
 
@@ -93,14 +95,18 @@ def _joint(
     floor: float,
 ) -> list[Misfit]:
     """Findings of a joint from its trajectories and what the model leaves of each [T] [rad]."""
-    speeds = [speed_of(t.time, t.position[:, column]) for t, _ in pairs]
-    residual = np.concatenate([left for _, left in pairs])
+    speeds = []
+    residuals = []
+    for trajectory, left in pairs:
+        speeds.append(speed_of(trajectory.time, trajectory.position[:, column]))
+        residuals.append(left)
+    residual = np.concatenate(residuals)
     speed = np.concatenate(speeds)
     top = float(np.percentile(np.abs(speed), 99.5)) + 1e-9
-    masks = [phases(t, column, resolution, top) for t, _ in pairs]
+    masks = [phases(trajectory, column, resolution, top) for trajectory, _ in pairs]
     rows = []
     for phase, when in PHASES.items():
-        mask = np.concatenate([m[phase] for m in masks])
+        mask = np.concatenate([inside[phase] for inside in masks])
         if mask.any() and _rms(residual[mask]) > REPEATABLE * floor:
             left = residual[mask]
             direction = np.sign(speed[mask])

@@ -72,7 +72,10 @@ class JointFit:
     @property
     def values(self) -> dict[str, float]:
         """Parameter values by key."""
-        return {c.key: float(c.value(x)) for c, x in zip(self.coordinates, self.x, strict=True)}
+        result = {}
+        for c, x in zip(self.coordinates, self.x, strict=True):
+            result[c.key] = float(c.value(x))
+        return result
 
     @property
     def rmse(self) -> float:
@@ -106,11 +109,11 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     white = floor**2 * np.diag(np.linalg.inv(fit.gram + ridge))
     jackknife = (folds - 1) * fit.refits.var(axis=0)
     width = half_width(np.maximum(jackknife, white), folds)
-    sizes = np.array([1.0 if c.log else x for c, x in zip(fit.coordinates, fit.x, strict=True)])
-    width = np.hypot(width, half_width((OWN_ERROR * sizes) ** 2, np.inf))
-    width = np.hypot(width, fit.step_error)
+    own = half_width(np.square(OWN_ERROR), np.inf)
     result = {}
-    for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
+    for c, x, half, step in zip(fit.coordinates, fit.x, width, fit.step_error, strict=True):
+        size = 1.0 if c.log else x
+        w = np.hypot(np.hypot(half, own * size), step)
         low = c.value(max(x - w, c.lower))
         high = c.value(min(x + w, c.upper))
         result[c.key] = (float(low), float(high))
@@ -158,10 +161,14 @@ class JointProblem:
         self.folds = np.array(spec.folds)
         self.floor = spec.floor
         self.baseline = spec.baseline
-        of_trajectory = rollouts.sample_trajectory
-        parts = [rollouts.measured[of_trajectory == t, spec.joint] for t in spec.trajectories]
+        parts = []
+        counts = []
+        for trajectory in spec.trajectories:
+            own = rollouts.sample_trajectory == trajectory
+            parts.append(rollouts.measured[own, spec.joint])
+            counts.append(own.sum())
         self._measured = np.concatenate(parts)
-        self.count = np.array([len(part) for part in parts])
+        self.count = np.array(counts)
 
     def residuals(
         self, rows: np.ndarray, keep: np.ndarray | None = None, rollouts: Rollouts | None = None
@@ -201,39 +208,36 @@ class JointProblem:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
         chain = self.rollouts.chain
         column = int(chain.columns[self.joint])
-        speeds = []
-        accelerations = []
-        errors = []
-        durations = []
+        parts = []
+        duration = 0.0
         for index in self.trajectories:
             trajectory = self.rollouts.recording.trajectories[index]
-            speed = speed_of(trajectory.time, trajectory.position[:, column])
-            speeds.append(speed)
-            accelerations.append(speed_of(trajectory.time, speed))
-            errors.append(trajectory.command[:, column] - trajectory.position[:, column])
-            durations.append(trajectory.duration)
-        torque = row[servo.KP] * np.concatenate(errors)
-
-        def peak(values: np.ndarray) -> float:
-            return float(np.percentile(np.abs(values), 99.5))
-
+            position = trajectory.position[:, column]
+            speed = speed_of(trajectory.time, position)
+            torque = row[servo.KP] * (trajectory.command[:, column] - position)
+            parts.append([speed, speed_of(trajectory.time, speed), torque])
+            duration = max(duration, trajectory.duration)
+        motion = np.concatenate(parts, axis=1)
+        top_speed, acceleration, peak = np.percentile(np.abs(motion), 99.5, axis=1).tolist()
         return Scales(
             kp=float(row[servo.KP]),
-            torque=float(np.sqrt(np.mean(torque**2))) + 1e-9,
-            peak=peak(torque) + 1e-9,
-            speed=peak(np.concatenate(speeds)) + 1e-3,
-            acceleration=peak(np.concatenate(accelerations)) + 0.1,
+            torque=float(np.sqrt(np.mean(motion[2] ** 2))) + 1e-9,
+            peak=peak + 1e-9,
+            speed=top_speed + 1e-3,
+            acceleration=acceleration + 0.1,
             inertia=max(float(row[servo.INERTIA]) + chain.inertia_scale(self.joint), 1e-6),
             residual=residual,
-            duration=max(durations),
+            duration=duration,
         )
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
-        others = others_in(self.rollouts.chain, self.joint)
-        slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
-        absent = {f"joint_coupling.from_{slot + 1}" for slot in slots}
-        return [*self.baseline, *(key for key in keys_of(effects) if key not in absent)]
+        keys = [*self.baseline, *keys_of(effects)]
+        for slot in range(servo.MAX_JOINTS):
+            coupling = f"joint_coupling.from_{slot + 1}"
+            if coupling in keys and slot not in others_in(self.rollouts.chain, self.joint):
+                keys.remove(coupling)
+        return keys
 
     def plain(
         self, base: np.ndarray, start: Mapping[str, float] | None = None
@@ -249,8 +253,9 @@ class JointProblem:
             row[PARAMETERS[key].column] = value
         scales = self.scales(row, self.floor)
         # One speed limit as it is, one that binds, one that does not.
-        limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
-        fit = self.fit(base, (), [{}, *limits] if start is None else [start], scales)
+        binding = {"velocity_limit": scales.speed}
+        free = {"velocity_limit": FREE_SPEED * scales.speed}
+        fit = self.fit(base, (), [{}, binding, free] if start is None else [start], scales)
         return fit, self.scales(fit.rows[self.joint], fit.rmse)
 
     def fit(
@@ -275,12 +280,11 @@ class JointProblem:
             The best.
         """
         coordinates = [coordinate(key, scales) for key in self.fitted(effects)]
-        x0 = []
-        for start in starts:
-            values = [start.get(c.key, base[self.joint, c.column]) for c in coordinates]
-            pairs = zip(coordinates, values, strict=True)
-            x0.append(np.array([c.inverse(float(value)) for c, value in pairs]))
-        x = _Descent(self, base, coordinates).best(x0, iterations)
+        x0 = np.empty((len(starts), len(coordinates)))
+        for i, c in enumerate(coordinates):
+            for row, start in zip(x0, starts, strict=True):
+                row[i] = c.inverse(float(start.get(c.key, base[self.joint, c.column])))
+        x = _Descent(self, base, coordinates).best([*x0], iterations)
         return self._judged(base, tuple(effects), coordinates, x)
 
     def _judged(
@@ -385,8 +389,9 @@ class _Descent:
         self.problem = problem
         self.base = base
         self.coordinates = coordinates
-        self.lower = np.array([c.lower for c in coordinates])
-        self.upper = np.array([c.upper for c in coordinates])
+        bounds = np.array([(c.lower, c.upper) for c in coordinates])
+        self.lower = bounds[:, 0]
+        self.upper = bounds[:, 1]
         self.pull = np.sqrt(RIDGE) * problem.floor
 
     def residuals(self, x: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
@@ -398,8 +403,9 @@ class _Descent:
         self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0
     ) -> np.ndarray:
         """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences, their steps times a factor."""
-        pairs = zip(self.coordinates, x, strict=True)
-        steps = np.array([c.step(float(value), widen) for c, value in pairs])
+        steps = np.empty(len(x))
+        for i, c in enumerate(self.coordinates):
+            steps[i] = c.step(float(x[i]), widen)
         moved = np.vstack([x, x + np.diag(steps)])
         rows = self.problem.rows(self.base, self.coordinates, moved)
         mask = None if keep is None else np.repeat(keep[None], len(moved), axis=0)
@@ -453,9 +459,9 @@ class _Descent:
         """
         left = list(starts)
         while len(left) > 1:
-            left = [self.descend(x, SHORT) for x in left]
-            left.sort(key=lambda x: float(np.sum(self.residuals(x) ** 2)))
-            left = left[: (len(left) + 1) // 2]
+            ends = [self.descend(x, SHORT) for x in left]
+            ends.sort(key=lambda x: float(np.sum(self.residuals(x) ** 2)))
+            left = ends[: (len(ends) + 1) // 2]
         x = self.descend(left[0], iterations)
         return self.descend(x, iterations, widen=WIDEN)
 

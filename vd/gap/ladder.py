@@ -13,6 +13,7 @@ smoothed command; a torque that is limited, falls with speed, saturates or follo
 or an ignored error; a soft transmission; a load or an offset.
 """
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -71,70 +72,44 @@ class Ladder:
         done: list[JointFit] = []
         while len(done) < ROUNDS and (centre := self.centre(done)):
             self.fit_changes(centre, FITTED)
-            self.prune()
             done.append(centre)
         completed: list[JointFit] = []
-        while len(completed) < COMPLETED:
-            centre = next((fit for fit in self.good() if fit not in completed), None)
-            if centre is None:
-                return
+        while len(completed) < COMPLETED and (centre := next_of(self.good(), completed)):
             self.fit_changes(centre, 0)
             completed.append(centre)
 
     def centre(self, done: Sequence[JointFit]) -> JointFit | None:
         """The best good model, what has the best score, or another good one, if no round was about it yet."""
+        inside = [fit for fit in self.models.values() if not rules.at_bound(fit)]
         first, *others = self.good()
-        for fit in (first, self.best(), *others):
-            if fit not in done:
-                return fit
-        return None
+        return next_of([first, rules.best_of(self.evidence, inside), *others], done)
 
     def good(self) -> list[JointFit]:
         """The good models, the best first."""
         return rules.good_models(self.evidence, list(self.models.values()))
 
-    def best(self) -> JointFit:
-        """The model with the best score, of those within their bounds."""
-        inside = [fit for fit in self.models.values() if not rules.at_bound(fit)]
-        return rules.best_of(self.evidence, inside)
-
     def fit_changes(self, centre: JointFit, additions: int) -> None:
         """Fit the models that differ from one in one family; of those with one more the most promising."""
-        smaller = []
-        starts = []
+        starts: list[tuple[Effects, dict[str, float]]] = []
+        calls: dict[Effects, FitCall] = {}
         for effects in rules.changes(centre.effects, self.candidates):
             added = effects - {*centre.effects}
             if not added:
-                smaller.append(effects)
+                calls[effects] = self.call(effects, [within(centre.values, effects)])
             elif effects not in self.models:
-                starts += [(effects, start) for start in self.sizes_of(added)]
-        calls: dict[Effects, FitCall] = {}
-        for effects in smaller:
-            calls[effects] = self.call(effects, [within(centre.values, effects)])
+                starts += itertools.product([effects], self.sizes_of(added))
         for effects, best in self.promising(centre, starts, additions).items():
             calls[effects] = self.call(effects, self.beginnings(centre, effects, best))
         self.fit(calls)
-
-    def prune(self) -> None:
-        """Fit the best model without what can be nothing in it, until nothing in it can."""
-        best = None
-        while best is not self.best():
-            best = self.best()
-            idle = rules.idle(self.evidence, best)
-            calls: dict[Effects, FitCall] = {}
-            for names in (*([name] for name in idle), idle):
-                effects = frozenset(best.effects) - {*names}
-                calls[effects] = self.call(effects, [within(best.values, effects)])
-            if idle:
-                self.fit(calls)
 
     def sizes_of(self, added: Iterable[str]) -> list[dict[str, float]]:
         """Starting values of effects together, by key: small with small, large with large."""
         lists = []
         for name in sorted(added):
+            fitted = {*self.nominal, *keys_of([name])}
             starts = sizes(name, self.others, self.scales)
             # None that differ only in what the joint's baseline does not fit.
-            lists.append([s for s in starts if all("." in key or key in self.nominal for key in s)])
+            lists.append([start for start in starts if start.keys() <= fitted])
         longest = max(map(len, lists))
         result = []
         for index in range(longest):
@@ -155,16 +130,20 @@ class Ladder:
             return {}
         changed = []
         for effects, start in starts:
-            left_out = keys_of({*centre.effects} - effects)
-            changed.append({key: PARAMETERS[key].neutral for key in left_out} | start)
+            change = dict(start)
+            for key in keys_of({*centre.effects} - effects):
+                change[key] = PARAMETERS[key].neutral
+            changed.append(change)
         call = partial(JointProblem.promise, fit=centre, starts=changed, scales=self.scales)
         (promise,) = self.run([call])
         best: dict[Effects, list[dict[str, float]]] = {}
         for index in np.argsort(-promise):
             effects, start = starts[index]
             if effects in best or len(best) < additions or {*centre.effects} - effects:
-                best.setdefault(effects, []).append(start)
-        return {effects: values[:STARTS] for effects, values in best.items()}
+                own = best.setdefault(effects, [])
+                if len(own) < STARTS:
+                    own.append(start)
+        return best
 
     def beginnings(
         self, centre: JointFit, effects: Effects, added: Sequence[Mapping[str, float]]
@@ -178,7 +157,9 @@ class Ladder:
         starts = [{**values, **start} for start in added]
         stiffness = self.nominal.get("kp", 0.0)
         torque = stiffness / values["kp"] if stiffness and "kp" in values else 1.0
-        nominal = {key: v * torque ** torque_power(key) for key, v in starts[0].items()}
+        nominal = {}
+        for key, v in starts[0].items():
+            nominal[key] = v * torque ** torque_power(key)
         nominal |= self.nominal
         if "velocity_limit" in self.nominal:
             # No slope leads to a speed limit that binds from one that does not.
@@ -209,6 +190,14 @@ class Ladder:
             known = self.models.get(effects)
             if known is None or fit.rmse < known.rmse:
                 self.models[effects] = fit
+
+
+def next_of(models: Iterable[JointFit], done: Sequence[JointFit]) -> JointFit | None:
+    """The first model that is not done."""
+    for fit in models:
+        if fit not in done:
+            return fit
+    return None
 
 
 def within(values: Mapping[str, float], effects: Iterable[str]) -> dict[str, float]:

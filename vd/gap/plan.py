@@ -62,11 +62,14 @@ def plan(report: Report, recording: Recording, hand: "HandModel | None") -> Expe
         shaky = [row.joint for row in report.joints if row.verdict not in ("effects", "no_gap")]
         families = dict.fromkeys(shaky or report.recording.joints, ())
         sets = (BASIC,) if report.verdict == "under_excited" else UNKNOWN
-    menu = excitation_set(_reach(recording, hand), sets)
-    menu = [motion for motion in menu if motion.joints[0] in families]
     common = _common(recording)
-    motions = [replace(motion, conditions={**common, **motion.conditions}) for motion in menu]
-    sentence = _sentence(families, sets, sum(motion.duration for motion in motions))
+    motions = []
+    seconds = 0.0
+    for motion in excitation_set(_reach(recording, hand), sets):
+        if motion.joints[0] in families:
+            motions.append(replace(motion, conditions={**common, **motion.conditions}))
+            seconds += motion.duration
+    sentence = _sentence(families, sets, seconds)
     return Experiment(recording.model, recording.joints, families, sets, tuple(motions), sentence)
 
 
@@ -97,8 +100,8 @@ def write_plan(experiment: Experiment, folder: Path) -> Path:
         entry = entry_of(replace(motion, file=f"{PLAN_FOLDER}/{motion.file}"))
         write_table(Path(folder) / entry["file"], motion, experiment.joints, ("command", "enabled"))
         entries.append(entry)
-    contents = {name: value for name, value in vars(experiment).items() if name != "motions"}
-    contents |= {"format": FORMAT, "trajectories": entries}
+    contents = {**vars(experiment), "format": FORMAT, "trajectories": entries}
+    del contents["motions"]
     write_json(path, to_dict(contents))
     return path
 
@@ -115,24 +118,30 @@ def discard_plan(folder: Path) -> None:
 def _common(recording: Recording) -> dict[str, float | str]:
     """The conditions that a recording has throughout."""
     first, *others = recording.trajectories
+    shared = {*first.conditions.items()}
+    for trajectory in others:
+        shared.intersection_update(trajectory.conditions.items())
     result = {}
     for key, value in first.conditions.items():
-        if all(trajectory.conditions.get(key) == value for trajectory in others):
+        if (key, value) in shared:
             result[key] = float(value) if isinstance(value, int) else value
     return result
 
 
 def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
     """How far joints may move: in the hand's range, or in that of the commands before."""
-    commands = np.concatenate([trajectory.command for trajectory in recording.trajectories])
-    lower = commands.min(axis=0)
-    upper = commands.max(axis=0)
+    commands = []
+    gain = 0.0
+    for trajectory in recording.trajectories:
+        commands.append(trajectory.command)
+        gain = max(gain, float(trajectory.conditions.get("p_gain", 0.0)))
+    lower = np.concatenate(commands).min(axis=0)
+    upper = np.concatenate(commands).max(axis=0)
     if hand is not None:
-        index = [hand.joint_names.index(name) for name in recording.joints]
+        index = [*map(hand.joint_names.index, recording.joints)]
         lower = hand.lower[index]
         upper = hand.upper[index]
-    gains = [float(t.conditions.get("p_gain", 0.0)) for t in recording.trajectories]
-    return JointRange(recording.joints, lower, upper, max(gains) or 1.0, (0.0, 0.0))
+    return JointRange(recording.joints, lower, upper, gain or 1.0, (0.0, 0.0))
 
 
 def _sentence(families: Mapping[str, Sequence[str]], sets: Sequence[str], seconds: float) -> str:

@@ -81,10 +81,10 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         gap=gap,
         overlays=overlays,
         residuals=residuals,
-        trajectories=[_trajectory_row(row) for row in report.trajectories],
-        families=[_family_row(row) for row in report.families],
-        models=[_model_row(row) for row in report.models],
-        compared=[_model_row(row) for row in report.compared],
+        trajectories=[*map(_trajectory_row, report.trajectories)],
+        families=[*map(_family_row, report.families)],
+        models=[*map(_model_row, report.models)],
+        compared=[*map(_model_row, report.compared)],
         credits=[_credit_row(report, row) for row in report.credits],
         not_tried=_not_tried(report),
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
@@ -95,8 +95,8 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
 
 def _headline(report: Report) -> list[Row]:
     held = report.held_out
-    names = dict.fromkeys(plain(effect.name) for effect in report.effects)
-    answer = words.listing(names or ["nothing named"])
+    names = dict.fromkeys(effect.name for effect in report.effects)
+    answer = words.causes(names or ["nothing named"], "and")
     before = (
         f"held out, the plain servo model; {mrad(report.baseline.rmse_rad)} where it was fitted"
     )
@@ -116,8 +116,11 @@ def _headline(report: Report) -> list[Row]:
 
 
 def _joint_row(report: Report, one: JointGap) -> Row:
-    own = [finding.where for finding in report.findings if finding.joint == one.joint]
-    where = [text.removeprefix(f"{one.joint}: ") for text in own]
+    where = []
+    for finding in report.findings:
+        joint, _, text = finding.where.partition(": ")
+        if joint == one.joint:
+            where.append(text)
     return (
         one.joint,
         "; ".join(where) or "nothing",
@@ -134,7 +137,9 @@ def _trajectory_row(row: TrajectoryError) -> Row:
 def _not_tried(report: Report) -> list[Row]:
     rows: list[Row] = []
     for joint, reasons in report.not_tried.items():
-        rows += [(joint, plain(name), plain(reason)) for name, reason in reasons.items()]
+        for name, reason in reasons.items():
+            why = plain(reason)
+            rows.append((joint, plain(name), why))
     return rows
 
 
@@ -160,10 +165,11 @@ def _model_row(row: WholeModel) -> Row:
 
 def _credit_row(report: Report, row: Credit) -> Row:
     (joint,) = [each for each in report.joints if each.joint == row.joint]
+    fitted = report.identified.per_joint[row.joint]
     return (
         row.joint,
         plain(row.effect),
-        f"{mrad(joint.identified_fitted_rmse_rad)} with it, {mrad(row.without_rmse_rad)} without",
+        f"{mrad(fitted)} with it, {mrad(row.without_rmse_rad)} without",
         f"{mrad(joint.identified_rmse_rad)} with it, {mrad(row.without_held_out_rmse_rad)} without",
     )
 

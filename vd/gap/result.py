@@ -124,9 +124,6 @@ class JointGap:
     """One sentence: why this verdict."""
     open_sets: tuple[tuple[str, ...], ...] = ()
     """Effects that stand in for each other in this joint's good models, a set each."""
-    baseline_fitted_rmse_rad: float = math.nan
-    """On the motions that it was fitted to, as the next."""
-    identified_fitted_rmse_rad: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -301,8 +298,10 @@ class Report:
             if values["format"] != FORMAT:
                 raise ValueError(f"format is {values['format']!r}, not {FORMAT!r}")
             known = _each_number(values, lambda x: math.nan if x is None else x)
-            absent = {name: None for name in _OPTIONAL if values.get(name) is None}
-            return from_dict(Report, {**known, **absent})
+            for name in _OPTIONAL:
+                if values.get(name) is None:
+                    known[name] = None
+            return from_dict(Report, known)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: no report of this vd-gap ({error}); run it again") from error
 
@@ -311,7 +310,8 @@ class Report:
         """The sets in ``ambiguous`` that another recording can split, without what their names stand for."""
         sets: dict[frozenset[str], tuple[str, ...]] = {}
         for joint in self.joints:
-            sets |= {frozenset(group): group for group in joint.open_sets}
+            for group in joint.open_sets:
+                sets[frozenset(group)] = group
         return tuple(sets.values())
 
 
@@ -338,16 +338,26 @@ class Predictions:
     @staticmethod
     def of(recording: Recording, baseline: np.ndarray, identified: np.ndarray) -> "Predictions":
         """Both models beside all that was recorded."""
-        parts = recording.trajectories
+        files = []
+        times = []
+        trajectories = []
+        commands = []
+        positions = []
+        for index, part in enumerate(recording.trajectories):
+            files.append(part.file)
+            times.append(part.time)
+            trajectories.append(np.full(len(part.time), index))
+            commands.append(part.command)
+            positions.append(part.position)
         return Predictions(
-            time=np.concatenate([t.time for t in parts]),
-            trajectory=np.repeat(np.arange(len(parts)), [len(t.time) for t in parts]),
-            command=np.concatenate([t.command for t in parts]),
-            measured=np.concatenate([t.position for t in parts]),
+            time=np.concatenate(times),
+            trajectory=np.concatenate(trajectories),
+            command=np.concatenate(commands),
+            measured=np.concatenate(positions),
             baseline=baseline,
             identified=identified,
             joints=recording.joints,
-            files=tuple(t.file for t in parts),
+            files=tuple(files),
         )
 
     def write(self, path: Path) -> None:
@@ -369,14 +379,18 @@ class Predictions:
             raise ValueError(
                 f"{path}: not curves of vd-gap ({error}); run vd-gap explain again"
             ) from error
-        names = {key: tuple(arrays[key].tolist()) for key in ("joints", "files")}
-        return Predictions(**{**arrays, **names})
+        for key in ("joints", "files"):
+            arrays[key] = tuple(arrays[key].tolist())
+        return Predictions(**arrays)
 
 
 def _each_number(value: Any, change: Callable[[float | None], float | None]) -> Any:
     """Nested dictionaries and lists with their numbers changed; None stands for one."""
     if isinstance(value, dict):
-        return {name: _each_number(item, change) for name, item in value.items()}
+        result = {}
+        for name, item in value.items():
+            result[name] = _each_number(item, change)
+        return result
     if isinstance(value, list):
         return [_each_number(item, change) for item in value]
     return change(value) if value is None or isinstance(value, float) else value

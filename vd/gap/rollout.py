@@ -77,14 +77,21 @@ class Rollouts:
         self.dt = dt
         self.device = device
         self.num_joints = len(chain.joints)
-        trajectories = recording.trajectories
-        counts = [len(t.time) for t in trajectories]
+        counts = []
+        streams = []
+        times = []
+        positions = []
+        for trajectory in recording.trajectories:
+            counts.append(len(trajectory.time))
+            streams.append(trajectory.stream)
+            times.append(trajectory.time)
+            positions.append(trajectory.position[:, chain.columns])
         self._count = np.array(counts, np.int32)
         self._first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
-        self._stream = np.array([t.stream for t in trajectories], np.int32)
-        self.time = np.concatenate([t.time for t in trajectories])
-        self.measured = np.concatenate([t.position[:, chain.columns] for t in trajectories])
-        self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)
+        self._stream = np.array(streams, np.int32)
+        self.time = np.concatenate(times)
+        self.measured = np.concatenate(positions)
+        self.sample_trajectory = np.repeat(np.arange(len(counts)), counts)
 
     def at(self, dt: float) -> "Rollouts":
         """The same with another time step [s]."""
@@ -92,18 +99,19 @@ class Rollouts:
 
     @cached_property
     def _samples(self) -> Samples:
-        trajectories = self.recording.trajectories
-        columns = self.chain.columns
-        command = np.concatenate([t.command[:, columns] for t in trajectories])
-        power = np.concatenate(
-            [t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories]
-        )
+        commands = []
+        powers = []
+        sent = []
+        for trajectory in self.recording.trajectories:
+            gain = self._gain(trajectory.conditions)
+            commands.append(trajectory.command[:, self.chain.columns])
+            powers.append(trajectory.enabled[:, self.chain.columns] * gain)
+            sent.append(trajectory.sent)
         samples = Samples()
         samples.step, samples.fraction = self._steps_of(self.time)
-        sent = np.concatenate([t.sent for t in trajectories])
-        samples.sent_step, samples.sent_fraction = self._steps_of(sent)
-        samples.command = wp.array(command, dtype=float, device=self.device)
-        samples.power = wp.array(power, dtype=float, device=self.device)
+        samples.sent_step, samples.sent_fraction = self._steps_of(np.concatenate(sent))
+        samples.command = self._floats(np.concatenate(commands))
+        samples.power = self._floats(np.concatenate(powers))
         return samples
 
     def _steps_of(self, time: np.ndarray) -> tuple[wp.array, wp.array]:
@@ -115,24 +123,24 @@ class Rollouts:
         fraction = (steps - whole).astype(np.float32)
         whole = whole + (fraction >= 1.0)
         fraction = np.where(fraction < 1.0, fraction, 0.0)
-        return (
-            wp.array(whole, dtype=int, device=self.device),
-            wp.array(fraction, dtype=float, device=self.device),
-        )
+        return self._integers(whole), self._floats(fraction)
 
     def _gain(self, conditions: dict[str, float | str]) -> float:
         reference = self.chain.reference_p_gain
         return float(conditions.get("p_gain", reference)) / reference if reference else 1.0
 
+    def _integers(self, values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=int, device=self.device)
+
+    def _floats(self, values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=float, device=self.device)
+
     @cached_property
-    def _links(self) -> tuple[Any, wp.array, wp.array, wp.array, wp.array]:
-        """The links; slots; lower and upper stops; efforts."""
+    def _links(self) -> list[Any]:
+        """Slots, lower and upper stops, efforts, whether links have mass, and the links."""
         chain = self.chain
-        links = links_of(chain)
-        slot = wp.array(chain.slot, dtype=int, device=self.device)
-        bounds = (chain.lower, chain.upper, chain.effort)
-        lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
-        return links, slot, lower, upper, effort
+        bounds = map(self._floats, (chain.lower, chain.upper, chain.effort))
+        return [self._integers(chain.slot), *bounds, int(chain.bodies), links_of(chain)]
 
     def predict(
         self,
@@ -198,32 +206,20 @@ class Rollouts:
         device = self.device
         shape = (len(trajectory), self.num_joints, servo.STATE_COLUMNS)
         state = wp.empty(shape, dtype=float, device=device)
-        links, slot, lower, upper, effort = self._links
-
-        def integers(values: np.ndarray) -> wp.array:
-            return wp.array(values, dtype=int, device=device)
-
         first = self._first[trajectory]
         wp.launch(
             rollout_kernel(room_for(self.num_joints)),
             dim=len(trajectory),
             inputs=[
                 self._samples,
-                integers(first),
-                integers(self._count[trajectory]),
-                integers(output),
-                integers(self._stream[trajectory]),
-                wp.array(self.measured[first], dtype=float, device=device),
-                integers(wanted),
-                slot,
-                lower,
-                upper,
-                effort,
-                int(self.chain.bodies),
-                links,
-                wp.array(
-                    parameters.reshape(-1, servo.PARAMETER_COLUMNS), dtype=float, device=device
-                ),
+                self._integers(first),
+                self._integers(self._count[trajectory]),
+                self._integers(output),
+                self._integers(self._stream[trajectory]),
+                self._floats(self.measured[first]),
+                self._integers(wanted),
+                *self._links,
+                self._floats(parameters.reshape(-1, servo.PARAMETER_COLUMNS)),
                 self.dt,
             ],
             outputs=[state, predicted],

@@ -190,9 +190,8 @@ def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:
     """The candidates that stand for others of the candidates, and for which."""
     result = {}
     for name, others in equivalent(model).items():
-        inside = tuple(other for other in others if other in names)
-        if name in names and inside:
-            result[name] = inside
+        if name in names and (inside := {*names}.intersection(others)):
+            result[name] = tuple(sorted(inside, key=others.index))
     return result
 
 
@@ -218,7 +217,9 @@ def contradicted(telemetry: Telemetry) -> dict[str, str]:
         reason = f"the recorded duty cycle follows the plain error ({share}): it acts downstream"
     else:
         return result
-    return result | {name: reason for name in UPSTREAM if name != late}
+    result |= dict.fromkeys(UPSTREAM, reason)
+    result.pop(late, None)
+    return result
 
 
 def late_side(telemetry: Telemetry) -> str:
@@ -248,13 +249,14 @@ def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[st
     """
     present = {*effects}
     result = []
-    swaps = []
+    swaps: list[tuple[set[str], tuple[str, ...]]] = []
     for family in FAMILIES.values():
-        swaps += [(present - family.effects, member) for member in ((), *family.members)]
+        rest = present - family.effects
+        swaps += itertools.product([rest], [(), *family.members])
     if "asymmetric_friction" in present:  # friction beside a load or an offset can be the same
         rest = present - FAMILIES["dry friction"].effects - FAMILIES["load or offset"].effects
-        for member in FAMILIES["load or offset"].members:
-            swaps.append((rest | {"coulomb_friction"}, member))
+        friction = rest | {"coulomb_friction"}
+        swaps += itertools.product([friction], FAMILIES["load or offset"].members)
     for rest, member in swaps:
         model = frozenset(rest.union(member))
         if model != present and {*allowed}.issuperset(model - present):
@@ -293,9 +295,10 @@ def too_few(fit: JointFit) -> str:
 
 def scores(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
     """Log of the error of C models plus the price of what they have [C]."""
-    error = np.log(np.maximum(rmse(errors(evidence, fits), fits[0].count), 1e-12))
-    sizes = [len(fit.effects) + len(fit.x) - len(fits[0].x) for fit in fits]
-    return error + PENALTY * np.array(sizes, float)
+    result = np.log(np.maximum(rmse(errors(evidence, fits), fits[0].count), 1e-12))
+    for i, fit in enumerate(fits):
+        result[i] += PENALTY * (len(fit.effects) + len(fit.x) - len(fits[0].x))
+    return result
 
 
 def errors(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
@@ -304,8 +307,14 @@ def errors(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
     Those on held-out motions. Once a model leaves white residuals, all samples tell more than the
     luck of a held-out motion.
     """
-    by_samples = any(white(evidence, fit) for fit in fits)
-    return np.stack([fit.sse if by_samples else fit.held_out for fit in fits])
+    held_out = []
+    fitted = []
+    by_samples = False
+    for fit in fits:
+        held_out.append(fit.held_out)
+        fitted.append(fit.sse)
+        by_samples = by_samples or white(evidence, fit)
+    return np.stack(fitted if by_samples else held_out)
 
 
 def at_bound(fit: JointFit) -> str:
@@ -315,8 +324,9 @@ def at_bound(fit: JointFit) -> str:
             return f"{c.key.partition('.')[0]} fits only with a parameter at its bound"
     if "asymmetric_friction" in fit.effects:
         # No dry friction spares one direction: what does is a load, and a greater one would push.
-        sides = [fit.values[f"asymmetric_friction.tau_{side}_nm"] for side in ("plus", "minus")]
-        if min(sides) <= OWN_ERROR * max(sides):
+        plus = fit.values["asymmetric_friction.tau_plus_nm"]
+        minus = fit.values["asymmetric_friction.tau_minus_nm"]
+        if min(plus, minus) <= OWN_ERROR * max(plus, minus):
             return "asymmetric_friction fits only with none in one direction"
     return ""
 
@@ -410,12 +420,15 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
 def earned(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
     """The models that explain something and earn what they have more than each that they contain."""
     sound = [fit for fit in fits if not fit.effects or not flaw(evidence, fit)]
-    result = []
-    for fit in sound:
-        smaller = [other for other in sound if contains(fit, other)]
-        if not any(not_earned(evidence, other, fit) for other in smaller):
-            result.append(fit)
-    return result
+    return [fit for fit in sound if not unearned(evidence, sound, fit)]
+
+
+def unearned(evidence: Evidence, fits: Sequence[JointFit], fit: JointFit) -> str:
+    """Beside which smaller model one does not earn what it has more, and why; empty if none."""
+    for smaller in fits:
+        if contains(fit, smaller) and (why := not_earned(evidence, smaller, fit)):
+            return f"beside {model_text(smaller.effects)} {why}"
+    return ""
 
 
 # 4. Which models are good.
@@ -457,9 +470,13 @@ def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
 def good_models(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
     """The models that are not worse than the best, the best first."""
     candidates = earned(evidence, fits)
-    order = np.argsort(scores(evidence, candidates))
-    best, *others = [candidates[index] for index in order]
-    return [best, *(fit for fit in others if not_worse(evidence, best, fit))]
+    first, *others = np.argsort(scores(evidence, candidates))
+    good = [candidates[first]]
+    for index in others:
+        fit = candidates[index]
+        if not_worse(evidence, good[0], fit):
+            good.append(fit)
+    return good
 
 
 def against(
@@ -473,12 +490,8 @@ def against(
         good: The good ones, the best first.
         fit: The model.
     """
-    if problem := flaw(evidence, fit):
-        return problem
-    for smaller in fits:
-        if contains(fit, smaller) and (why := not_earned(evidence, smaller, fit)):
-            return f"beside {model_text(smaller.effects)} {why}"
-    return f"worse than {model_text(good[0].effects)}"
+    worse = f"worse than {model_text(good[0].effects)}"
+    return flaw(evidence, fit) or unearned(evidence, fits, fit) or worse
 
 
 def shares(evidence: Evidence, good: Sequence[JointFit]) -> np.ndarray:
@@ -541,9 +554,12 @@ def conclude(
             "of the squared gap, less than half"
         )
         return Conclusion("unknown", text, plain, tuple(good), weights)
-    names = tuple(name for name in good[0].effects if all(name in fit.effects for fit in good))
+    shared = {*good[0].effects}
+    for fit in good:
+        shared.intersection_update(fit.effects)
+    names = tuple(sorted(shared, key=good[0].effects.index))
     families = families_of(good, weights, fits)
-    certain = [name for name, certainty in families.items() if certainty == "certain"]
+    certain = [name for name in families if families[name] == "certain"]
     if names:
         reason = f"all models that are not worse than the best have {listing(names)}"
     elif certain:
@@ -563,9 +579,8 @@ def nothing_named(
     if white(evidence, plain):
         quiet = "the plain model leaves no more than noise"
         return ("under_excited", loose) if loose else ("no_gap", quiet)
-    others = [fit for fit in fits if fit.effects]
     why = "there is no candidate"
-    if others:
+    if others := [fit for fit in fits if fit.effects]:
         best = best_of(evidence, others)
         why = f"the best model, {model_text(best.effects)}: "
         why += not_earned(evidence, plain, best) or flaw(evidence, best) or "not needed"
@@ -582,11 +597,10 @@ def recovered(evidence: Evidence, plain: JointFit, fit: JointFit) -> float:
     One motion can be all that shows a parameter. That no fit without it predicts it says nothing
     against a model that leaves white residuals.
     """
-    pairs = [(plain.rmse, fit.rmse)]
-    if not white(evidence, fit):
-        pairs.append((plain.held_out_rmse, fit.held_out_rmse))
-    gaps = [(b**2 - a**2) / max(b**2 - evidence.floor**2, 1e-30) for b, a in pairs]
-    return float(min(gaps))
+    before = np.array([plain.rmse, plain.held_out_rmse])
+    after = np.array([fit.rmse, fit.held_out_rmse])
+    shares = (before**2 - after**2) / np.maximum(before**2 - evidence.floor**2, 1e-30)
+    return float(shares[0] if white(evidence, fit) else shares.min())
 
 
 def families_of(
@@ -598,15 +612,21 @@ def families_of(
     coins, are not to be expected; untold if not.
     """
     motions = len(good[0].count)
-    tried = set().union(*(fit.effects for fit in fits))
+    tried: set[str] = set()
+    for fit in fits:
+        tried.update(fit.effects)
     result: dict[str, Certainty] = {}
     for name, family in FAMILIES.items():
-        having = np.array([bool(family.effects.intersection(fit.effects)) for fit in good])
-        if having.all():
+        best = 0.0
+        having = 0
+        for fit, weight in zip(good, weights, strict=True):
+            if family.effects.intersection(fit.effects):
+                having += 1
+                best += weight * motions
+        if having == len(good):
             result[name] = "certain"
-        elif having.any():
-            best = round(weights[having].sum() * motions)
-            luck = binom.sf(best - 1, motions, 0.5)
+        elif having:
+            luck = binom.sf(round(best) - 1, motions, 0.5)
             result[name] = "likely" if luck < 1.0 - CONFIDENCE else "untold"
         elif tried & family.effects:
             result[name] = "excluded"
@@ -615,12 +635,20 @@ def families_of(
 
 def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
     """Effects that stand in for each other in the good models, a set each."""
-    names = list(dict.fromkeys(itertools.chain.from_iterable(fit.effects for fit in good)))
-    having = np.array([[name in fit.effects for name in names] for fit in good])
-    loose = np.flatnonzero(~having.all(axis=0))
-    together = having[:, loose].T @ having[:, loose]
-    count, labels = connected_components(~together)
-    return [tuple(names[i] for i in loose[labels == group]) for group in range(count)]
+    models: dict[str, set[int]] = {}
+    for index, fit in enumerate(good):
+        for name in fit.effects:
+            models.setdefault(name, set()).add(index)
+    loose = [name for name in models if len(models[name]) < len(good)]
+    apart = np.zeros((len(loose), len(loose)))
+    for i, name in enumerate(loose):
+        for j, other in enumerate(loose):
+            apart[i, j] = models[name].isdisjoint(models[other])
+    count, labels = connected_components(apart)
+    sets: list[tuple[str, ...]] = [()] * count
+    for name, group in zip(loose, labels, strict=True):
+        sets[group] += (name,)
+    return sets
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:

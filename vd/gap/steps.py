@@ -70,8 +70,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         known = (*EFFECTS, NO_EFFECTS)
-        if unknown := [name for name in self.effects if name not in known]:
-            raise ValueError(f"effects: there is no {unknown[0]}; choose from {', '.join(known)}")
+        for name in self.effects:
+            if name not in known:
+                raise ValueError(f"effects: there is no {name}; choose from {', '.join(known)}")
 
 
 class Analysis:
@@ -134,11 +135,13 @@ class Analysis:
         """
         if self.settings.hand_layer is None:
             return {}
-        moved = set().union(*(trajectory.joints for trajectory in self.recording.trajectories))
-        joints = tuple(joint for joint in self.recording.joints if joint in moved)
+        moved: set[str] = set()
+        for trajectory in self.recording.trajectories:
+            moved.update(trajectory.joints)
+        joints = [joint for joint in self.recording.joints if joint in moved]
         if self.hand is not None:
             rows = dict(zip(self.hand.joint_names, self.hand.servo, strict=True))
-            return {joint: rows[joint] for joint in moved.intersection(rows)}
+            return {joint: rows[joint] for joint in joints if joint in rows}
         from vd.assets_usd.hand_layer import read_bare_layer
 
         found, _ = read_bare_layer(self.settings.hand_layer, joints)
@@ -178,20 +181,23 @@ class Analysis:
             ValueError: One of them has not run on this input.
         """
         seconds = self._seconds()
+        result = {}
         for name in steps:
             if name not in seconds:
                 again = f"vd-gap {name} {self.settings.recording} --out {self.out}"
                 raise ValueError(f"{self.out} lacks what comes before; run {again} first")
-        return {name: seconds[name] for name in steps}
+            result[name] = seconds[name]
+        return result
 
     def _seconds(self) -> dict[str, float]:
         """Seconds of every step that has run on this input, and whose files are there."""
         try:
             record = json.loads((self.out / RUN).read_text())
-            same = record["made_from"] == self._made_from
+            if record["made_from"] != self._made_from:
+                return {}
             there = {path.name for path in self.out.iterdir()}
             ran = record["steps"].items()
-            return {name: s for name, s in ran if same and there.issuperset(OUTPUTS[name])}
+            return {name: seconds for name, seconds in ran if there.issuperset(OUTPUTS[name])}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}  # none, or written by something else: start afresh
 
@@ -228,8 +234,11 @@ class Analysis:
             "--seed": settings.seed,
             "--device": device,
         }
-        said = [f" {flag} {value}" for flag, value in flags.items() if value]
-        return f"vd-gap run {settings.recording} --out {self.out}{''.join(said)}"
+        said = f"vd-gap run {settings.recording} --out {self.out}"
+        for flag, value in flags.items():
+            if value:
+                said += f" {flag} {value}"
+        return said
 
 
 def _show(line: str) -> None:

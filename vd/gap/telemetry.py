@@ -47,10 +47,11 @@ def telemetry_of(
     (delay,) = EFFECTS["command_delay"].parameters
     late = {}
     for side in ("command_delay", "read_delay"):
-        lags = np.arange(0.0, delay.upper, STEP_S)
-        left = [1.0 - _follows(parts, chain, joint, **{side: lag}) for lag in lags]
-        best = int(np.argmin(left))
-        late[side] = float(lags[best]), left[best]
+        late[side] = (0.0, np.inf)
+        for lag in np.arange(0.0, delay.upper, STEP_S):
+            left = 1.0 - _follows(parts, chain, joint, **{side: lag})
+            if left < late[side][1]:
+                late[side] = (float(lag), left)
     return Telemetry(
         fall=_voltage_fall(driven, int(chain.columns[joint])),
         follows=_follows(driven, chain, joint),

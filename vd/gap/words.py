@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import get_args
 
-from vd.gap.result import LAYER, Certainty, Estimate, Interval, NamedEffect, Report, WholeModel
+from vd.gap.result import LAYER, Certainty, Estimate, Interval, NamedEffect, Report
 from vd.gap.statistics import REPEATABLE
 
 LISTED = 4
@@ -72,8 +72,9 @@ def amount(value: float, unit: str) -> str:
 def estimate(one: Estimate) -> str:
     """``40.2 ms (95 %: 39.1 to 41.3)``."""
     factor, shown = _size(one.value, one.unit)
-    value, low, high = (f"{factor * x:.4g}" for x in (one.value, *one.ci95))
-    return f"{value} {shown}".strip() + f" (95 %: {low} to {high})"
+    low, high = one.ci95
+    value = f"{factor * one.value:.4g} {shown}".strip()
+    return f"{value} (95 %: {factor * low:.4g} to {factor * high:.4g})"
 
 
 def effects_sentence(effects: Iterable[NamedEffect]) -> str:
@@ -81,11 +82,12 @@ def effects_sentence(effects: Iterable[NamedEffect]) -> str:
 
     Each name once.
     """
-    places: dict[str, list[str]] = {}
+    parts: dict[str, str] = {}
     for effect in effects:
-        sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
-        places.setdefault(effect.name, []).append(f"{joints_text(effect.joints)} ({sizes})")
-    return listing(f"{plain(name)} on {', '.join(where)}" for name, where in places.items())
+        sizes = [amount(number.value, number.unit) for number in effect.parameters.values()]
+        begin = f"{parts[effect.name]}," if effect.name in parts else f"{plain(effect.name)} on"
+        parts[effect.name] = f"{begin} {joints_text(effect.joints)} ({', '.join(sizes)})"
+    return listing(parts.values())
 
 
 def verdict_sentence(report: Report) -> str:
@@ -123,7 +125,7 @@ def gap(report: Report) -> str:
 def change(report: Report) -> str:
     """How errors change with the whole identified model, on motions held out and where it was fitted."""
     held = report.held_out
-    model = {*(effect.name for effect in (*report.effects, *report.provisional))}
+    model = {effect.name for effect in (*report.effects, *report.provisional)}
     if not model:
         return ""
     names = causes(sorted(model), "and")
@@ -189,12 +191,12 @@ def _besides(report: Report) -> str:
     """What else the names may stand for, and what else is missing."""
     text = ""
     if any(effect.name == "encoder_bias" for effect in report.effects):
-        text += (
+        text = (
             " An encoder bias is first of all a difference of zeros between command and reading: "
             "compare them before you use the model."
         )
     for name, *others in report.ambiguous:
-        if not any({name, *others} >= {*group} for group in report.open_sets):
+        if not any({name, *others}.issuperset(group) for group in report.open_sets):
             text += (
                 f" {plain(name).capitalize()} stands for {causes(others, 'and')} too: commands and "
                 "positions are the same, whichever it is."
@@ -204,11 +206,11 @@ def _besides(report: Report) -> str:
 
 def _leaves(report: Report) -> str:
     """Which models are still possible."""
-    joints = [row for row in report.joints if row.open_sets]
+    joints = [row.joint for row in report.joints if row.open_sets]
     if len(joints) > 1:
-        return f"On {joints_text([row.joint for row in joints])} several models are as good."
-    models = [row for row in report.models if row.joint == joints[0].joint]
-    return f"{len(models)} models are as good: {listing([model_text(row.effects) for row in models], 'or')}."
+        return f"On {joints_text(joints)} several models are as good."
+    models = [model_text(row.effects) for row in report.models if row.joint == joints[0]]
+    return f"{len(models)} models are as good: {listing(models, 'or')}."
 
 
 def model_text(effects: Iterable[str]) -> str:
@@ -225,7 +227,9 @@ def families_sentences(report: Report) -> list[str]:
                 joints.setdefault(row.joint, {}).setdefault(verdict, []).append(row.name)
     sentences = []
     for joint, verdicts in joints.items():
-        parts = [f"{verdict}: {listing(names)}" for verdict, names in verdicts.items()]
+        parts = []
+        for verdict, names in verdicts.items():
+            parts.append(f"{verdict}: {listing(names)}")
         sentences.append(f"{joint}: {'; '.join(parts)}")
     return sentences
 
@@ -256,18 +260,13 @@ def training_layer(report: Report) -> str:
 
 def open_questions(report: Report) -> list[str]:
     """The whole models of each joint that are left open, with their errors."""
+    joints = [row.joint for row in report.models]
     rows = []
-    for joint in report.joints:
-        models = [row for row in report.models if row.joint == joint.joint]
-        if len(models) > 1:
-            rows += [f"{joint.joint}: {model_row(model)}" for model in models]
+    for row in report.models:
+        if joints.count(row.joint) > 1:
+            errors = f"{mrad(row.rmse_rad)} fitted, {mrad(row.held_out_rmse_rad)} held out"
+            rows.append(f"{row.joint}: {model_text(row.effects)} ({errors})")
     return rows
-
-
-def model_row(model: WholeModel) -> str:
-    """``backlash with command delay (4 mrad fitted, 5 mrad held out)``."""
-    errors = f"{mrad(model.rmse_rad)} fitted, {mrad(model.held_out_rmse_rad)} held out"
-    return f"{model_text(model.effects)} ({errors})"
 
 
 def _size(value: float, unit: str) -> tuple[float, str]:

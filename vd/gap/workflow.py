@@ -18,8 +18,8 @@ from vd.assets_usd.hand_data import HandModel
 from vd.command.files import write_json
 from vd.gap import rules
 from vd.gap.assemble import AnalysedJoint, assemble, curves
-from vd.gap.chain import Chain, chains, others_in, relative_torques
-from vd.gap.coordinates import PARAMETERS
+from vd.gap.chain import Chain, chains, others_in
+from vd.gap.coordinates import values_of
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, JointProblem, JointSpec, Problems
@@ -86,8 +86,7 @@ def find(
         name = problems.chains[spec.chain].joints[spec.joint]
         floors[name] = spec.floor
         rows[name] = {"rows": fit.rows.tolist()}
-    models = [(spec, fit.rows) for spec, fit in zip(specs, fits, strict=True)]
-    misfits = findings(problems.recording, curves(problems, models), floors)
+    misfits = findings(problems.recording, curves(problems, specs, fits), floors)
     value = {
         "format": FIND_FORMAT,
         "findings": [asdict(misfit) for misfit in misfits],
@@ -132,10 +131,8 @@ def explain(
             analysis = _JointAnalysis(pool, problems, spec, chosen, number / len(specs), len(specs))
             analysed[spec] = analysis.run(rows, list(analysed.values()))
     misfits = [Misfit(**misfit) for misfit in before["findings"]]
-    joints = [analysed[spec] for spec in specs]
+    joints = [*map(analysed.__getitem__, specs)]
     report, predictions = assemble(problems, joints, misfits, chosen.seed)
-    relative = relative_torques(problems.recording)
-    report = replace(report, recording=replace(report.recording, relative_torques=relative))
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
     chosen.progress(f"explain: {report.verdict}")
@@ -198,7 +195,7 @@ class _JointAnalysis:
             if other.spec.chain == spec.chain:
                 base[other.spec.joint] = other.conclusion.final.rows[other.spec.joint]
         base[spec.joint] = chain.start_row[spec.joint]
-        start = baseline_values(rows[spec.joint], spec.baseline)
+        start = values_of(rows[spec.joint], spec.baseline)
         ((plain, scales),) = self.ask([partial(JointProblem.plain, base=base, start=start)])
         evidence = rules.Evidence(spec.floor, spec.folds, plain.rmse)
         loose = rules.undetermined(evidence, plain)
@@ -209,7 +206,7 @@ class _JointAnalysis:
             candidates=allowed,
             scales=scales,
             others=others_in(chain, spec.joint),
-            nominal=baseline_values(chain.start_row[spec.joint], spec.baseline),
+            nominal=values_of(chain.start_row[spec.joint], spec.baseline),
             evidence=evidence,
             models={frozenset(): plain},
         )
@@ -237,18 +234,13 @@ class _JointAnalysis:
                 means[name] = others
                 for other in others:
                     vetoes[other] = f"leaves the same positions as {name}, which stands for both"
-        names = rules.candidates(chain, self.options.effects)
-        names = [name for name in names if name not in vetoes]
+        allowed = rules.candidates(chain, self.options.effects)
+        names = [name for name in allowed if name not in vetoes]
         return names, vetoes, {**means, **TOGETHER}
 
 
 STAGES = 12
 """Batches of fits of a joint at most."""
-
-
-def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
-    """Values of a baseline's parameters in a row [PARAMETER_COLUMNS], by key."""
-    return {key: float(row[PARAMETERS[key].column]) for key in keys}
 
 
 def _workers(problems: Problems, options: Options) -> WorkerPool:
@@ -264,28 +256,28 @@ def _problems(
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     parts = []
     specs = []
+    dt = STEP_S
     for index, chain in enumerate(chains(recording, hand)):
-        pairs = zip(chain.joints, chain.start_row, strict=True)
-        rows = [options.start.get(name, row) for name, row in pairs]
-        parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
-        for joint, column in enumerate(chain.columns):
+        rows = chain.start_row.astype(float)
+        parts.append(replace(chain, start_row=rows))
+        for joint, name in enumerate(chain.joints):
+            rows[joint] = options.start.get(name, rows[joint])
             trajectories, folds, aside = design(recording, chain, joint)
             if trajectories:
-                specs.append(
-                    JointSpec(
-                        chain=index,
-                        joint=joint,
-                        trajectories=trajectories,
-                        folds=folds,
-                        floor=noise_floor(recording, int(column)),
-                        baseline=baseline_of(chain),
-                        pieces=pieces(recording, chain, trajectories),
-                        aside=aside,
-                    )
+                spec = JointSpec(
+                    chain=index,
+                    joint=joint,
+                    trajectories=trajectories,
+                    folds=folds,
+                    floor=noise_floor(recording, int(chain.columns[joint])),
+                    baseline=baseline_of(chain),
+                    pieces=pieces(recording, chain, trajectories),
+                    aside=aside,
                 )
-    # A recording so long that pieces of it are analysed would take minutes a joint with the usual
-    # step.
-    dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
+                specs.append(spec)
+                if spec.pieces:
+                    # A recording so long that pieces of it are analysed would take minutes a joint.
+                    dt = 2.0 * STEP_S
     return Problems(recording, parts, dt, options.device), specs
 
 
@@ -295,9 +287,9 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
     Without known masses, torques are known up to a factor: a pendulum's load holds it if known, the
     nominal stiffness if not.
     """
-    anchor = ""
-    if not chain.bodies:
-        anchor = "tau_g_nm" if chain.reference_load is not None else "kp"
+    if chain.bodies:
+        return chain.baseline_free
+    anchor = "tau_g_nm" if chain.reference_load is not None else "kp"
     return tuple(name for name in chain.baseline_free if name != anchor)
 
 
@@ -313,7 +305,7 @@ def _identify(
         share = 100.0 * (number + 1) / len(specs)
         line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
         options.progress(f"find: {share:3.0f} % {chain.joints[spec.joint]}: {line}")
-    if all(len(chain.joints) == 1 for chain in chains):
+    if not chains[0].bodies:
         return fits
     again = []
     for spec, fit in zip(specs, fits, strict=True):

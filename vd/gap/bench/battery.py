@@ -59,13 +59,15 @@ def battery(
     for name in effects:
         if name not in shown:
             raise ValueError(f"--effects: there is no {name}; choose from {', '.join(shown)}")
-    names = tuple(effects) or tuple(name for name in shown if name not in NOT_NAMED)
+    names = effects or [name for name in shown if name not in NOT_NAMED]
     changes = ("exact", "base", "mass") if model in HANDS else ("exact", "base")
     numbers = range(first_seed, first_seed + seeds)
 
     def sized(kind: str, among: Sequence[str]) -> list[Case]:
-        each = itertools.product(numbers, sizes, among)
-        return [Case(kind, model, (name,), size, seed, battery=which) for seed, size, name in each]
+        result = []
+        for seed, size, name in itertools.product(numbers, sizes, among):
+            result.append(Case(kind, model, (name,), size, seed, battery=which))
+        return result
 
     nothing = []
     for number in range(NOTHING_A_SEED * seeds):
@@ -80,7 +82,7 @@ def battery(
         "pair": pairs,
         "outside": sized("outside", (*OUTSIDE, *NOT_NAMED)),
     }
-    return list(itertools.chain.from_iterable(cases[kind] for kind in kinds))
+    return [*itertools.chain(*map(cases.__getitem__, kinds))]
 
 
 def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:

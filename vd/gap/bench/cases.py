@@ -46,9 +46,17 @@ def run_cases(
         The results of all.
     """
     make_folder(folder)
-    done = {case: read_result(folder / f"{case.name}.json") for case in cases}
-    failed = [case for case in cases if "error" in (done[case] or {})]
-    waiting = [*(case for case in cases if done[case] is None), *failed]
+    done = {}
+    missing = []
+    failed = []
+    for case in cases:
+        result = read_result(folder / f"{case.name}.json")
+        done[case] = result
+        if result is None:
+            missing.append(case)
+        elif "error" in result:
+            failed.append(case)
+    waiting = missing + failed
     print(
         f"{len(cases) - len(waiting)} of {len(cases)} cases have results; {len(waiting)} to run",
         flush=True,
@@ -64,4 +72,4 @@ def run_cases(
         print(f"[{next(numbers)}/{len(waiting)}] {case.name}: {answer}", flush=True)
 
     run_tasks(work, waiting, finished, jobs=jobs, limit_s=limit_s, gpu=gpu)
-    return [result for result in done.values() if result is not None]
+    return [*filter(None, done.values())]

@@ -19,7 +19,7 @@ from vd.assets_usd.objects.sets import load_set
 from vd.command.files import write_json, write_text
 from vd.gap.bench.cases import run_cases
 from vd.gap.bench.hidden_contact import OUTSIDE, ContactPlant, hide_contact
-from vd.gap.bench.score import HEAD, Figure
+from vd.gap.bench.score import Figure, table
 from vd.gap.contact import by_weight, identify_contact, verdict
 from vd.logs.contact_recording import read_contact_recording
 
@@ -80,12 +80,12 @@ def battery(which: str, seeds: int) -> list[ContactCase]:
         which: ``development`` or ``closed``.
         seeds: Recordings of each parameter and cause; a quarter of each pair.
     """
-    cases: list[tuple[str, tuple[str, ...]]] = [("single", (name,)) for name in CONTACT]
-    cases += [("none", ())] * 10 + [("outside", (name,)) for name in OUTSIDE]
-    cases *= seeds
-    cases += [("pair", pair) for pair in itertools.combinations(CONTACT, 2)] * math.ceil(seeds / 4)
+    single = itertools.product(["single"], itertools.combinations(CONTACT, 1))
+    outside = itertools.product(["outside"], itertools.combinations(OUTSIDE, 1))
+    pairs = itertools.product(["pair"], itertools.combinations(CONTACT, 2))
+    cases = [*single, *[("none", ())] * 10, *outside] * seeds + [*pairs] * math.ceil(seeds / 4)
     first = FIRST_SEED[which]
-    return [ContactCase(kind, hidden, first + i) for i, (kind, hidden) in enumerate(cases)]
+    return [ContactCase(*case, seed) for seed, case in enumerate(cases, first)]
 
 
 def run_case(case: ContactCase, folder: Path) -> dict[str, Any]:
@@ -132,35 +132,36 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
 
     Then what was not named as hidden.
     """
-    right: dict[str, list[bool]] = {"single": [], "none": [], "pair": [], "outside": []}
-    clean: dict[str, list[bool]] = {kind: [] for kind in right}
-    first: list[bool] = []
-    told: list[bool] = []
-    covers: list[bool] = []
+    first = Figure("first name right", least=0.9)
+    clean = Figure("one hidden: no false name", least=0.98)
+    nothing = Figure("nothing hidden: no false name", least=0.98)
+    both = Figure("two hidden: both named, nothing else")
+    nearest = Figure("outside the table: nothing or the nearest")
+    covers = Figure("95 % intervals that cover")
+    told = Figure("parameters told")
     lines: list[str] = []
     for result in results:
         case = ContactCase(**result["case"])
         named = list(result.get("named", ["failed"]))
         hidden = [OUTSIDE.get(name, name) for name in case.hidden]
-        right[case.kind].append({*named} == {*hidden})
-        clean[case.kind].append({*named} <= {*hidden})
+        right = {*named} == {*hidden}
+        no_other = {*named} <= {*hidden}
         if case.kind == "outside":
+            nearest.values.append(no_other)
             continue
         if case.kind == "single":
-            first.append(named[:1] == hidden)
+            first.values.append(named[:1] == hidden)
+            clean.values.append(no_other)
+        elif case.kind == "pair":
+            both.values.append(right)
+        else:
+            nothing.values.append(no_other)
         for parameter in result.get("parameters", {}).values():
-            told.append(parameter["verdict"] != "unknown")
-            covers += parameter["covered"] if told[-1] else []
-        if not right[case.kind][-1]:
+            known = parameter["verdict"] != "unknown"
+            told.values.append(known)
+            if known:
+                covers.values += parameter["covered"]
+        if not right:
             lines.append(f"- {case.name}: {', '.join(named) or 'nothing'}")
-    figures = [
-        Figure("first name right", first, least=0.9),
-        Figure("one hidden: no false name", clean["single"], least=0.98),
-        Figure("nothing hidden: no false name", clean["none"], least=0.98),
-        Figure("two hidden: both named, nothing else", right["pair"]),
-        Figure("outside the table: nothing or the nearest", clean["outside"]),
-        Figure("95 % intervals that cover", covers),
-        Figure("parameters told", told),
-    ]
-    rows = [figure.row() for figure in figures]
-    return "\n".join([*HEAD, *rows, "", "Not as hidden:", "", *lines, ""])
+    figures = table([first, clean, nothing, both, nearest, covers, told])
+    return "\n".join([figures, "Not as hidden:", "", *lines, ""])

@@ -76,6 +76,50 @@ class ContactPlant:
         return value + 1.0 / RIGID_N_M if name == "tip_compliance" else value
 
 
+SCENE = """
+<mujoco>
+  <option timestep="{step}" integrator="{integrator}" gravity="{gravity}"/>
+  <asset>{meshes}</asset>
+  <worldbody>
+    <geom name="table" type="plane" size="2 2 0.1" contype="0" conaffinity="0"/>
+    <body name="object">
+      <freejoint/>
+      <inertial pos="{centre}" quat="{axes}" mass="{mass}" diaginertia="{inertia}"/>
+      {geoms}
+    </body>
+    {tip}
+  </worldbody>
+  <contact>{pairs}</contact>
+</mujoco>
+"""
+"""The object on the table: hulls for the finger, a small sphere at each corner for the table. Between
+a mesh and a plane MuJoCo finds three contacts, on which a cube rocks."""
+TIP = f"""
+    <body name="tip" gravcomp="1">
+      <joint type="slide" axis="1 0 0"/>
+      <joint type="slide" axis="0 1 0"/>
+      <joint type="slide" axis="0 0 1"/>
+      <geom type="sphere" size="{TIP_RADIUS_M}" mass="{TIP_KG}" contype="0" priority="2"
+            solref="0.002 1" solimp="0.99 0.999 0.001 0.5 2"/>
+    </body>
+"""
+"""The pusher."""
+HULL = """
+      <geom type="mesh" mesh="hull_{0}" contype="1" conaffinity="0"/>
+"""
+CORNER = """
+      <geom name="corner_{0}" type="sphere" size="{1}" pos="{2}" contype="0" conaffinity="0"/>
+"""
+PAIR = """
+    <pair geom1="table" geom2="corner_{0}" condim="1" solref="{1}" solimp="0.999 0.999 0.001 0.5 2"/>
+"""
+
+
+def _text(values: Any) -> str:
+    """Numbers as MuJoCo's files have them."""
+    return " ".join(map(str, np.ravel(values).tolist()))
+
+
 class World:
     """The compiled scene of one motion, and what happens in it step by step."""
 
@@ -86,78 +130,47 @@ class World:
         self.stiffening = outside.get("stiffening_tip", 0.0)
         self.stiffness = 1.0 / plant.value("tip_compliance")
         self.damping = 2.0 * TIP_DAMPING * math.sqrt(self.stiffness * TIP_KG)
-        self.corners = np.unique(
-            np.concatenate([vertices for vertices, _ in plant.item.hulls]), axis=0
-        )
-        spec = mujoco.MjSpec()
+        self.step = float(rng.choice([4.0e-4, 5.0e-4]))
+        item = plant.item
+        mass = plant.value("mass")
         tilt = outside.get("tilted_table", 0.0)
-        spec.option.gravity = [GRAVITY_M_S2 * math.sin(tilt), 0.0, -GRAVITY_M_S2 * math.cos(tilt)]
-        spec.option.timestep = self.step = rng.choice([4.0e-4, 5.0e-4])
-        spec.option.integrator = rng.choice(
-            [int(mujoco.mjtIntegrator.mjINT_EULER), 3]
-        )  # or implicitfast
-        self._add_object(spec, plant)
-        if finger:
-            tip = spec.worldbody.add_body(name="tip", gravcomp=1.0)
-            for axis in np.eye(3):
-                tip.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            size = [TIP_RADIUS_M, 0.0, 0.0]
-            stiff = {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 1e-3, 0.5, 2.0]}
-            tip.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=size,
-                mass=TIP_KG,
-                contype=0,
-                priority=2,
-                **stiff,
-            )
-        self.model = spec.compile()
+        meshes = ""
+        geoms = ""
+        points = []
+        for i, (vertices, faces) in enumerate(item.hulls):
+            points.append(vertices)
+            meshes += f'<mesh name="hull_{i}" vertex="{_text(vertices)}" face="{_text(faces)}"/>'
+            geoms += HULL.format(i)
+        self.corners = np.unique(np.concatenate(points), axis=0)
+        ratio = damping_ratio(plant.value("restitution"))
+        bounce = _text([1.0 / (ratio * CONTACT_RATE), ratio])
+        pairs = ""
+        for i, corner in enumerate(self.corners):
+            geoms += CORNER.format(i, CORNER_M, _text(corner))
+            pairs += PAIR.format(i, bounce)
+        scene = SCENE.format(
+            step=self.step,
+            integrator=rng.choice(["Euler", "implicitfast"]),
+            gravity=_text(GRAVITY_M_S2 * np.array([math.sin(tilt), 0.0, -math.cos(tilt)])),
+            meshes=meshes,
+            centre=_text(plant.value("centre_of_mass")),
+            axes=_text(np.roll(item.inertia_quat, 1)),
+            mass=mass,
+            inertia=_text(item.inertia * mass / item.mass_kg),
+            geoms=geoms,
+            tip=TIP if finger else "",
+            pairs=pairs,
+        )
+        self.model = mujoco.MjModel.from_xml_string(scene)
         self.data = mujoco.MjData(self.model)
         self._first_corner = int(self.model.geom("corner_0").id)
         self.carriage = np.zeros(3)
-
-    def _add_object(self, spec: Any, plant: ContactPlant) -> None:
-        """The object on the table.
-
-        Hulls for the finger, a small sphere at each corner for the table.
-
-        Between a mesh and a plane MuJoCo finds three contacts, on which a cube rocks.
-        """
-        item = plant.item
-        mass = plant.value("mass")
-        kinds = mujoco.mjtGeom
-        spec.worldbody.add_geom(
-            name="table", type=kinds.mjGEOM_PLANE, size=[2, 2, 0.1], contype=0, conaffinity=0
-        )
-        body = spec.worldbody.add_body(name="object", explicitinertial=True)
-        body.add_freejoint()
-        x, y, z, w = item.inertia_quat
-        body.mass = mass
-        body.ipos = plant.value("centre_of_mass")
-        body.inertia = item.inertia * mass / item.mass_kg
-        body.iquat = [w, x, y, z]
-        for i, (vertices, faces) in enumerate(item.hulls):
-            spec.add_mesh(name=f"hull_{i}", uservert=vertices.flatten(), userface=faces.flatten())
-            body.add_geom(type=kinds.mjGEOM_MESH, meshname=f"hull_{i}", contype=1, conaffinity=0)
-        ratio = damping_ratio(plant.value("restitution"))
-        bounce = {
-            "solref": [1.0 / (ratio * CONTACT_RATE), ratio],
-            "solimp": [0.999, 0.999, 1e-3, 0.5, 2.0],
-        }
-        for i, corner in enumerate(self.corners):
-            name = f"corner_{i}"
-            size = [CORNER_M, 0.0, 0.0]
-            body.add_geom(
-                name=name, type=kinds.mjGEOM_SPHERE, size=size, pos=corner, contype=0, conaffinity=0
-            )
-            spec.add_pair(geomname1="table", geomname2=name, condim=1, **bounce)
 
     def place(
         self, position: np.ndarray, rotation: Rotation, velocity: np.ndarray, spin: np.ndarray
     ) -> None:
         """Put the object; velocity of its frame and spin in the world frame."""
-        x, y, z, w = rotation.as_quat()
-        self.data.qpos[:7] = [*position, w, x, y, z]
+        self.data.qpos[:7] = [*position, *np.roll(rotation.as_quat(), 1)]
         self.data.qvel[:6] = [*velocity, *rotation.inv().apply(spin)]
         mujoco.mj_forward(self.model, self.data)
 
@@ -173,16 +186,8 @@ class World:
             data.qfrc_applied[:] = 0.0
             self._slip()
             force = np.zeros(3) if way is None else self._pull(way(i * self.step))
-            rows.append(
-                [
-                    i * self.step,
-                    *data.qpos[:3],
-                    *data.qpos[4:7],
-                    data.qpos[3],
-                    *self.carriage,
-                    *force,
-                ]
-            )
+            x, y, z, *turn = data.qpos[:7]
+            rows.append([i * self.step, x, y, z, *np.roll(turn, -1), *self.carriage, *force])
             mujoco.mj_step(self.model, data)
         table = np.array(rows)
         return table[:, 0], table[:, 1:8], table[:, 8:11], table[:, 11:14]
@@ -238,9 +243,8 @@ def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generat
         inertia = world.model.body_inertia[1, 2]
         ahead = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi)).apply(ahead)
         push = mass * (speed / PUSH_OFF_S + world.friction * GRAVITY_M_S2) * ahead
-        return world.run(
-            0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S])
-        )
+        twist = inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S
+        return world.run(0.6, hand=np.array([*push, 0.0, 0.0, twist]))
     if kind == "press":
         above = np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004])
         force = rng.uniform(3.0, 8.0)
@@ -263,15 +267,14 @@ def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bo
     velocity = np.array([*rng.normal(0.0, 0.1, 2), 0.0 if flat else rng.uniform(0.8, 1.6)])
     spin = rng.normal(0.0, 0.1 if flat else 5.0, 3)
     world.place(place, tilt, velocity, spin)
-    time, pose, pusher, force = world.run(0.8)
+    time, pose, _, _ = world.run(0.8)
     before = np.arange(0.0, PUSH_OFF_S, world.step)
     way = 0.5 * before**2 / PUSH_OFF_S - 0.5 * PUSH_OFF_S
     turned = Rotation.from_rotvec(np.outer(way, spin)) * tilt
     held = np.hstack([place + np.outer(way, velocity), turned.as_quat()])
-    nothing = np.zeros((len(before), 3))
-    parts = (held, pose), (nothing, pusher), (nothing, force)
-    pose, pusher, force = (np.concatenate(part) for part in parts)
-    return np.concatenate([before, time + PUSH_OFF_S]), pose, pusher, force
+    time = np.concatenate([before, time + PUSH_OFF_S])
+    nothing = np.zeros((len(time), 3))
+    return time, np.concatenate([held, pose]), nothing, nothing
 
 
 class ImperfectTracker:
@@ -297,10 +300,8 @@ class ImperfectTracker:
         time, pose, pusher, force = truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
         asked = asked[rng.uniform(size=len(asked)) > 0.02]
-        late = (
-            rng.exponential(self.late_s, len(asked))
-            + (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
-        )
+        late = rng.exponential(self.late_s, len(asked))
+        late += (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
         at = np.searchsorted(time, asked - late).clip(0, len(time) - 1)
 
         def noisy(values: np.ndarray, deviation: float) -> np.ndarray:
@@ -309,12 +310,12 @@ class ImperfectTracker:
         turned = Rotation.from_rotvec(rng.normal(0.0, self.rotation_rad, (len(at), 3)))
         position = noisy(pose, self.position_m)
         rotation = turned * Rotation.from_quat(pose[at, 3:])
-        pushes = kind in ("push", "press")
         bias = rng.normal(0.0, self.force_n / 3.0, 3)
-        measured = (noisy(pusher, self.position_m), noisy(force, self.force_n) + bias)
-        return ContactMotion(
-            file, kind, asked, position, rotation, *(measured if pushes else [np.empty((0, 3))] * 2)
-        )
+        pusher = noisy(pusher, self.position_m)
+        force = noisy(force, self.force_n) + bias
+        if kind not in ("push", "press"):
+            pusher = force = np.empty((0, 3))
+        return ContactMotion(file, kind, asked, position, rotation, pusher, force)
 
 
 def hide_contact(
@@ -329,11 +330,11 @@ def hide_contact(
     """
     rng = np.random.default_rng(plant.seed)
     tracker = ImperfectTracker(rng)
-    motions = [
-        tracker.see(_motion(plant, kind, i, rng), kind, f"{kind}_{i}.csv")
-        for kind, count in counts.items()
-        for i in range(count)
-    ]
+    motions = []
+    for kind, count in counts.items():
+        for i in range(count):
+            truly = _motion(plant, kind, i, rng)
+            motions.append(tracker.see(truly, kind, f"{kind}_{i}.csv"))
     write_contact_recording(out, motions)
     truth = {
         "object": plant.item.name,

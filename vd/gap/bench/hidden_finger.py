@@ -28,7 +28,7 @@ def finger_of(hand: HandModel, finger: int, heavier: np.ndarray, payload: float 
         heavier: Factors of its links' masses and inertias [n].
         payload: Point mass at its tip [kg].
     """
-    joints = np.arange(hand.num_joints)[hand.fingers[finger]]
+    joints = hand.fingers[finger]
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
     parents = poses[hand.joint_parent[joints]]
     frames = hand.joint_parent_frame[joints]
@@ -111,18 +111,16 @@ class Finger:
         """
         links, bias = self._forward(q, v)
         system = links / dt
-        n = q.shape[1]
-        system[:, np.arange(n), np.arange(n)] += inertia / dt + resisting
+        joints = range(q.shape[1])
+        system[:, joints, joints] += inertia / dt + resisting
         momentum = np.einsum("bij,bj->bi", system, v) + push - bias
         new = v.copy()
         for _ in range(FRICTION_SWEEPS):
-            for i in range(n):
-                left = (
-                    momentum[:, i]
-                    - np.einsum("bj,bj->b", system[:, i], new)
-                    + system[:, i, i] * new[:, i]
-                )
-                new[:, i] = slip(left, minus[:, i], plus[:, i]) / system[:, i, i]
+            for i in joints:
+                own = system[:, i, i]
+                others = np.einsum("bj,bj->b", system[:, i], new)
+                left = momentum[:, i] - others + own * new[:, i]
+                new[:, i] = slip(left, minus[:, i], plus[:, i]) / own
         return new
 
 

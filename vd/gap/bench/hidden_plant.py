@@ -157,14 +157,19 @@ def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[Plant
     bias = batch.of("encoder_bias", "bias_rad")
     recorded = []
     for b, run in enumerate(runs):
-        columns = [
-            np.interp(run.time - delay[b, j], grid, path[:, b, j]) for j in range(batch.count)
-        ]
+        position = np.empty((len(run.time), batch.count))
+        for j in range(batch.count):
+            position[:, j] = np.interp(run.time - delay[b, j], grid, path[:, b, j])
         # The step after the stamp: a command is written before the servo is read.
         step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
         duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
-        recorded.append(PlantMotion(np.stack(columns, axis=1) + bias[b], duty))
+        recorded.append(PlantMotion(position + bias[b], duty))
     return recorded
+
+
+def stacked(things: Sequence[Any], name: str) -> np.ndarray:
+    """An attribute of each [B, ..]."""
+    return np.stack([getattr(thing, name) for thing in things])
 
 
 class _Batch:
@@ -173,18 +178,23 @@ class _Batch:
     def __init__(self, runs: Sequence[PlantRun], dt: float):
         self.runs = runs
         self.dt = dt
-        plants = [run.plant for run in runs]
-        self.plants = plants
-        self.count = len(plants[0].joints)
+        self.plants = [run.plant for run in runs]
+        self.count = len(self.plants[0].joints)
         self.steps = int(np.ceil(max(run.time[-1] for run in runs) / dt)) + 1
-        self.kp = np.stack([p.kp for p in plants])
-        self.kd = np.stack([p.kd for p in plants])
-        self.limit = np.stack([p.velocity_limit for p in plants])
-        self.gain = np.array([[float(r.conditions.get("p_gain", r.plant.full_gain))] for r in runs])
-        self.gain = self.gain / np.array([[p.full_gain] for p in plants]) * np.ones((1, self.count))
-        self.inertia = np.stack([p.inertia for p in plants]) + self.of("payload_inertia", "j_kgm2")
-        self.pendulum = np.stack([p.gravity_torque for p in plants])
-        self.body = self._finger()
+        self.kp = stacked(self.plants, "kp")
+        self.kd = stacked(self.plants, "kd")
+        self.limit = stacked(self.plants, "velocity_limit")
+        self.pendulum = stacked(self.plants, "gravity_torque")
+        inertia = stacked(self.plants, "inertia")
+        self.inertia = inertia + self.of("payload_inertia", "j_kgm2")
+        self.gain = np.ones_like(self.kp)
+        bodies = []
+        for row, run in zip(self.gain, runs, strict=True):
+            full = run.plant.full_gain
+            row *= float(run.conditions.get("p_gain", full)) / full
+            if run.plant.body:
+                bodies.append(run.plant.body(float(run.conditions.get("payload_kg", 0.0))))
+        self.body = Finger(bodies) if bodies else None
 
     def of(self, effect: str, parameter: str) -> np.ndarray:
         """A parameter of an effect for every run and joint [B, J]; 0 where the effect is absent."""
@@ -192,13 +202,6 @@ class _Batch:
         for row, plant in zip(values, self.plants, strict=True):
             row[:] = plant.effects.get(effect, {}).get(parameter, 0.0)
         return values
-
-    def _finger(self) -> Finger | None:
-        loads = [float(run.conditions.get("payload_kg", 0.0)) for run in self.runs]
-        bodies = [
-            plant.body(kg) for plant, kg in zip(self.plants, loads, strict=True) if plant.body
-        ]
-        return Finger(bodies) if bodies else None
 
     def references(self) -> np.ndarray:
         """What the servos pull to, before the joint has a say.
@@ -285,9 +288,9 @@ class _Batch:
         switch = self._switch()
         dead = 0.5 * self.of("dead_zone", "width_rad")
         integral_gain = self.of("integral_action", "k_i")
-        coupling = np.stack(
-            [self.of("joint_coupling", f"from_{i + 1}") for i in range(self.count)], axis=2
-        )
+        coupling = np.zeros((*self.kp.shape, self.count))
+        for i in range(self.count):
+            coupling[:, :, i] = self.of("joint_coupling", f"from_{i + 1}")
         coupling *= 1.0 - np.eye(self.count)
         q = self._equilibrium(reference[0, 0], switch[0], coupling)
         v = np.zeros_like(q)
@@ -397,11 +400,10 @@ class _Servo:
         self.sag = batch.of("supply_sag", "relative")
         self.rate = batch.of("thermal_drift", "rate_per_s")
         self.soft = np.minimum(_where_on(batch.of("torque_saturation", "tau_s_nm")), 1e9)
-        efforts = [np.inf if p.effort is None else p.effort for p in batch.plants]
-        self.hard = np.minimum(
-            _where_on(batch.of("torque_limit", "tau_max_nm")),
-            np.stack([np.broadcast_to(effort, batch.kp.shape[1:]) for effort in efforts]),
-        )
+        self.hard = _where_on(batch.of("torque_limit", "tau_max_nm"))
+        for row, plant in zip(self.hard, batch.plants, strict=True):
+            if plant.effort is not None:
+                row[:] = np.minimum(row, plant.effort)
         self.stall = _where_on(batch.of("torque_speed_limit", "tau_stall_nm"))
         self.idle = _where_on(batch.of("torque_speed_limit", "omega_0_rad_s"))
         self.stalls = np.isfinite(self.stall).any()
@@ -464,22 +466,21 @@ class _Loads:
             )
         self.load = of("load_friction", "k_load")
         self.static = of("stribeck_friction", "tau_s_nm")
-        self.sliding, self.scale = (
-            of("stribeck_friction", name) for name in ("tau_c_nm", "v_s_rad_s")
-        )
-        self.sides = [of("asymmetric_friction", name) for name in ("tau_minus_nm", "tau_plus_nm")]
+        self.sliding = of("stribeck_friction", "tau_c_nm")
+        self.scale = _where_on(of("stribeck_friction", "v_s_rad_s"))
+        self.minus = of("asymmetric_friction", "tau_minus_nm")
+        self.plus = of("asymmetric_friction", "tau_plus_nm")
         self.constant = of("coulomb_friction", "tau_c_nm") + self.sliding
         self.cold = of(WARMING, "cold_nm")
         self.warm = of(WARMING, "warm_nm")
         self.warming = _where_on(of(WARMING, "time_s"))
-        self.scale = _where_on(self.scale)
-        self.session = np.array([[run.session_s] for run in batch.runs])
+        self.session = stacked(batch.runs, "session_s")[:, None]
         self.loads = self.load.any()
         self.turn = self.rate = self.strain = np.zeros_like(self.weight)
         physics = [plant.physics for plant in batch.plants]
-        self.presliding = np.array([[each.presliding_rad] for each in physics]) + self.strain
-        self.gear = np.array([[each.ripple_nm] for each in physics])
-        self.teeth = np.array([[each.ripple_per_turn] for each in physics])
+        self.presliding = stacked(physics, "presliding_rad")[:, None] + self.strain
+        self.gear = stacked(physics, "ripple_nm")[:, None]
+        self.teeth = stacked(physics, "ripple_per_turn")[:, None]
 
     def bend(self, v: np.ndarray) -> None:
         """Bend what carries dry friction by a step at speeds [B, J]."""
@@ -508,7 +509,9 @@ class _Loads:
         ripple = self.ripple * np.sin(self.turns * q) + self.gear * np.sin(self.teeth * q)
         return drag - weight + ripple - self.cable * np.maximum(q - self.slack, 0.0)
 
-    def friction(self, motor: np.ndarray, v: np.ndarray, time: float) -> list[np.ndarray]:
+    def friction(
+        self, motor: np.ndarray, v: np.ndarray, time: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the friction torque against negative and positive motion [B, J] [N m].
 
         Args:
@@ -519,4 +522,4 @@ class _Loads:
         fading = (self.static - self.sliding) * np.exp(-np.square(v / self.scale))
         cooling = (self.cold - self.warm) * np.exp(-(self.session + time) / self.warming)
         bound = self.constant + self.load * motor + fading + self.warm + cooling
-        return [bound + side for side in self.sides]
+        return bound + self.minus, bound + self.plus

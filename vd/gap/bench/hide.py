@@ -4,7 +4,6 @@ The recording comes from :mod:`vd.gap.bench.hidden_plant`: random base parameter
 counts and jittered stamps. What is hidden is written beside the folder, never into it.
 """
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -51,24 +50,14 @@ FULL_P_GAIN = 400.0
 CHUNK = 48
 """Trajectories simulated together: enough to amortise Python, few enough for memory."""
 
+BASE = ("kp", "kd", "velocity_limit", "inertia", "gravity_torque")
+"""Base parameters of a plant, which the truth tells."""
 BARE = {
-    "servo": {
-        "kp": 3.0,
-        "kd": 0.3,
-        "velocity_limit": 7.0,
-        "inertia": 2.0e-3,
-        "gravity_torque": 0.0,
-    },
-    "pendulum": {
-        "kp": 3.0,
-        "kd": 0.2,
-        "velocity_limit": 8.0,
-        "inertia": 6.0e-3,
-        "gravity_torque": 0.4,
-    },
+    "servo": (3.0, 0.3, 7.0, 2.0e-3, 0.0),
+    "pendulum": (3.0, 0.2, 8.0, 6.0e-3, 0.4),
 }
-"""A hobby servo that turns a small load about a vertical axis; the rig of the XL330 recordings,
-some 0.4 kg on an arm of 0.1 m."""
+"""Base parameters of a hobby servo that turns a small load about a vertical axis, and of the rig of
+the XL330 recordings, some 0.4 kg on an arm of 0.1 m."""
 BARE_REACH_RAD = 1.5
 """Range of a bare servo about its centre [rad]."""
 INERTIA_SPREAD = math.log(2.0)
@@ -76,9 +65,6 @@ INERTIA_SPREAD = math.log(2.0)
 
 COUPLING = "joint_coupling"
 """The effect that takes more than one joint."""
-
-BASE = ("kp", "kd", "velocity_limit", "inertia", "gravity_torque")
-"""Base parameters of a plant that the truth tells."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +132,10 @@ def effect_parameters(name: str) -> dict[str, float]:
     Raises:
         ValueError: There is no such effect.
     """
-    if name in EFFECTS:
-        return {parameter.name: parameter.typical for parameter in EFFECTS[name].parameters}
     if name in OUTSIDE:
         return dict(OUTSIDE[name])
+    if name in EFFECTS:
+        return {parameter.name: parameter.typical for parameter in EFFECTS[name].parameters}
     raise ValueError(f"unknown effect {name!r}; choose from {', '.join((*EFFECTS, *OUTSIDE))}")
 
 
@@ -159,7 +145,7 @@ def hide(hiding: Hiding, out: str | Path) -> Hidden:
     Raises:
         ValueError: An unknown model, joint, effect, parameter or excitation.
     """
-    (hidden,) = simulate_hidden([hiding])
+    hidden = simulate_hidden(hiding)
     write_recording(hidden.recording, Path(out))
     write_json(truth_path(out), hidden.truth)
     return hidden
@@ -183,151 +169,137 @@ def check_hidden(out: Path) -> None:
         )
 
 
-def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
-    """Make recordings, many at a time: a batch costs little more than one.
-
-    Args:
-        hidings: What to hide; all of models with as many joints, all hands or none.
+def simulate_hidden(hiding: Hiding) -> Hidden:
+    """Make a recording.
 
     Raises:
         ValueError: As of :func:`hide`.
     """
-    sessions = [_Session(hiding) for hiding in hidings]
-    runs = list(itertools.chain.from_iterable(session.runs for session in sessions))
-    # Long trajectories with long ones: a batch runs as long as its longest, with one time step.
-    order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
-    moved: dict[int, PlantMotion] = {}
-    for step in {run.plant.physics.step_s for run in runs}:
-        same = [i for i in order if runs[i].plant.physics.step_s == step]
-        for start in range(0, len(same), CHUNK):
-            part = same[start : start + CHUNK]
-            moved.update(zip(part, simulate([runs[i] for i in part]), strict=True))
-    motions = (moved[i] for i in range(len(runs)))
-    return [session.finish([next(motions) for _ in session.runs]) for session in sessions]
-
-
-class _Session:
-    """One recording being made: what is drawn, what is to be simulated, what the sensor says."""
-
-    def __init__(self, hiding: Hiding):
-        self.hiding = hiding
-        self.rng = np.random.default_rng(hiding.seed)
-        reach, self.plant = machine(hiding, self.rng)
-        self.motions = numbered(excitation_set(reach, hiding.excitations))
-        self.runs: list[PlantRun] = []
-        session_s = 0.0
-        for motion in self.motions:
-            time = self._stamps(motion)
-            seed = int(self.rng.integers(2**31))
-            self.runs.append(
-                PlantRun(
-                    self.plant,
-                    time,
-                    motion.command,
-                    motion.enabled,
-                    motion.conditions,
-                    session_s,
-                    seed,
-                )
-            )
-            session_s += motion.duration + PAUSE_S
-
-    def _stamps(self, motion: Trajectory) -> np.ndarray:
-        """The instants at which commands are written and positions read [T] [s], from 0."""
-        time = motion.time + self.rng.normal(0.0, STAMP_JITTER_S, len(motion.time))
-        time[0] = 0.0
-        # Late ones push the next; as many digits as are written, so that readers see the same
-        # stamps.
-        for i in range(1, len(time)):
-            time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
-        return np.round(time, 6)
-
-    def _noise(self, shape: tuple[int, ...], time: np.ndarray) -> np.ndarray:
-        """Noise of a reading [T, J] [rad]; of the same size whatever its correlation."""
-        white = self.rng.normal(0.0, NOISE_RAD, shape)
-        if self.plant.physics.noise_s <= 0.0:
-            return white
-        keep = math.exp(-float(np.median(np.diff(time))) / self.plant.physics.noise_s)
-        new = math.sqrt(1.0 - keep * keep)
-        return lfilter([new], [1.0, -keep], white, axis=0, zi=(1.0 - new) * white[:1])[0]
-
-    def finish(self, moved: Sequence[PlantMotion]) -> Hidden:
-        """Add noise and rounding; the recording and the truth."""
-        hiding = self.hiding
-        trajectories = []
-        for motion, run, own in zip(self.motions, self.runs, moved, strict=True):
-            noisy = own.position + self._noise(own.position.shape, run.time)
-            trajectories.append(
-                replace(
-                    motion,
-                    conditions={"p_gain": self.plant.full_gain, **motion.conditions},
-                    time=run.time,
-                    position=np.round(noisy / ENCODER_COUNT) * ENCODER_COUNT,
-                    pwm=np.round(own.duty * PWM_COUNTS) / PWM_COUNTS if hiding.pwm else None,
-                )
-            )
-        servo: dict[str, Any] = {"model": "test rig", "p_gain": self.plant.full_gain}
-        if hiding.model in BARE_MODELS:  # without masses nothing else tells how large torques are
-            servo[STIFFNESS] = _by_joint(self.plant, self.plant.kp)
-        recording = Recording(
-            Path(),
-            hiding.model,
-            self.plant.joints,
-            {**servo, "pwm_full_scale": PWM_COUNTS} if hiding.pwm else servo,
-            ENCODER_COUNT,
-            tuple(trajectories),
+    rng = np.random.default_rng(hiding.seed)
+    reach, plant = machine(hiding, rng)
+    motions = numbered(excitation_set(reach, hiding.excitations))
+    runs = []
+    session_s = 0.0
+    for motion in motions:
+        time = _stamps(motion, rng)
+        seed = int(rng.integers(2**31))
+        run = PlantRun(
+            plant, time, motion.command, motion.enabled, motion.conditions, session_s, seed
         )
-        return Hidden(recording, self._truth())
+        runs.append(run)
+        session_s += motion.duration + PAUSE_S
+    moved = _simulate(runs)
+    trajectories = []
+    for motion, run, own in zip(motions, runs, moved, strict=True):
+        noise = reading_noise(hiding.physics.noise_s, own.position.shape, run.time, rng)
+        recorded = replace(
+            motion,
+            conditions={"p_gain": plant.full_gain, **motion.conditions},
+            time=run.time,
+            position=np.round((own.position + noise) / ENCODER_COUNT) * ENCODER_COUNT,
+            pwm=np.round(own.duty * PWM_COUNTS) / PWM_COUNTS if hiding.pwm else None,
+        )
+        trajectories.append(recorded)
+    servo: dict[str, Any] = {"model": "test rig", "p_gain": plant.full_gain}
+    if hiding.model in BARE_MODELS:  # without masses nothing else tells how large torques are
+        servo[STIFFNESS] = _by_joint(plant, plant.kp)
+    if hiding.pwm:
+        servo["pwm_full_scale"] = PWM_COUNTS
+    recording = Recording(
+        Path(), hiding.model, plant.joints, servo, ENCODER_COUNT, tuple(trajectories)
+    )
+    return Hidden(recording, _truth(hiding, plant))
 
-    def _truth(self) -> dict[str, Any]:
-        plant = self.plant
-        hiding = self.hiding
-        effects: dict[str, Any] = {}
-        for name, parameters in plant.effects.items():
-            values = {key: _by_joint(plant, value) for key, value in parameters.items()}
-            effects[name] = {"joints": list(plant.joints), "parameters": values}
-        return {
-            "format": "vd-hidden/1",
-            "model": hiding.model,
-            "seed": hiding.seed,
-            "noise_floor_rad": NOISE_FLOOR_RAD,
-            "mass_spread": hiding.mass_spread,
-            "base": {name: _by_joint(plant, getattr(plant, name)) for name in BASE},
-            "effects": effects,
-        }
+
+def _stamps(motion: Trajectory, rng: np.random.Generator) -> np.ndarray:
+    """The instants at which commands are written and positions read [T] [s], from 0."""
+    time = motion.time + rng.normal(0.0, STAMP_JITTER_S, len(motion.time))
+    time[0] = 0.0
+    # Late ones push the next; as many digits as are written, so that readers see the same stamps.
+    for i in range(1, len(time)):
+        time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
+    return np.round(time, 6)
+
+
+def _simulate(runs: Sequence[PlantRun]) -> list[PlantMotion]:
+    """Simulate runs, those of about the same length together: a batch runs as long as its longest."""
+    order = sorted(range(len(runs)), key=lambda index: runs[index].time[-1])
+    moved: dict[int, PlantMotion] = {}
+    for start in range(0, len(order), CHUNK):
+        part = order[start : start + CHUNK]
+        motions = simulate([runs[index] for index in part])
+        moved.update(zip(part, motions, strict=True))
+    return [moved[index] for index in range(len(runs))]
+
+
+def reading_noise(
+    noise_s: float, shape: tuple[int, ...], time: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Noise of a reading [T, J] [rad]; of the same size whatever its correlation time [s]."""
+    white = rng.normal(0.0, NOISE_RAD, shape)
+    if noise_s <= 0.0:
+        return white
+    keep = math.exp(-float(np.median(np.diff(time))) / noise_s)
+    new = math.sqrt(1.0 - keep * keep)
+    return lfilter([new], [1.0, -keep], white, axis=0, zi=(1.0 - new) * white[:1])[0]
+
+
+def _truth(hiding: Hiding, plant: HiddenPlant) -> dict[str, Any]:
+    effects: dict[str, Any] = {}
+    for name, parameters in plant.effects.items():
+        values = {}
+        for key, value in parameters.items():
+            values[key] = _by_joint(plant, value)
+        effects[name] = {"joints": list(plant.joints), "parameters": values}
+    base = {}
+    for name in BASE:
+        base[name] = _by_joint(plant, getattr(plant, name))
+    return {
+        "format": "vd-hidden/1",
+        "model": hiding.model,
+        "seed": hiding.seed,
+        "noise_floor_rad": NOISE_FLOOR_RAD,
+        "mass_spread": hiding.mass_spread,
+        "base": base,
+        "effects": effects,
+    }
 
 
 def _by_joint(plant: HiddenPlant, values: np.ndarray) -> dict[str, float]:
-    return {joint: float(value) for joint, value in zip(plant.joints, values, strict=True)}
+    return dict(zip(plant.joints, values.tolist(), strict=True))
 
 
 def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
     """Draw the machine: the range of its joints, and the plant with its effects."""
     reach, plant = _bare(hiding, rng) if hiding.model in BARE_MODELS else _finger(hiding, rng)
-    effects = {}
+    effects: dict[str, dict[str, np.ndarray]] = {}
     for name, given in hiding.effects.items():
-        typical = effect_parameters(name)
-        signed = []
-        if name in EFFECTS:
-            signed = [p.name for p in EFFECTS[name].parameters if p.signed]
-        for key, value in given.items():
-            if key not in typical:
-                raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")
-            if not math.isfinite(value):
-                raise ValueError(f"{name}: {key} is {value}; give a finite number")
-            if value < 0.0 and key not in signed:
-                raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
+        _check_effect(name, given)
         if name == COUPLING and len(plant.joints) == 1:
             raise ValueError(
                 f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand"
             )
-        on = np.ones(len(plant.joints))
-        effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
+        effects[name] = {}
+        for key, value in {**effect_parameters(name), **given}.items():
+            effects[name][key] = np.full(len(plant.joints), value)
     return reach, replace(plant, effects=effects, physics=hiding.physics)
 
 
+def _check_effect(name: str, given: Mapping[str, float]) -> None:
+    typical = effect_parameters(name)
+    signed = []
+    if name in EFFECTS:
+        signed = [p.name for p in EFFECTS[name].parameters if p.signed]
+    for key, value in given.items():
+        if key not in typical:
+            raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")
+        if not math.isfinite(value):
+            raise ValueError(f"{name}: {key} is {value}; give a finite number")
+        if value < 0.0 and key not in signed:
+            raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
+
+
 def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
-    nominal = BARE[hiding.model]
     joints = hiding.joints or ("joint" if hiding.model == "servo" else "pendulum",)
     count = len(joints)
     near = _spread(rng, hiding.base_spread, (3, count))
@@ -335,9 +307,8 @@ def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenP
     reach = JointRange(
         joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN
     )
-    base = {}
-    for name, factor in zip(BASE, [*near, *far], strict=True):
-        base[name] = nominal[name] * factor
+    values = np.vstack([near, far]) * np.array(BARE[hiding.model])[:, None]
+    base = dict(zip(BASE, values, strict=True))
     return reach, HiddenPlant(joints=joints, **base, full_gain=FULL_P_GAIN)
 
 
