@@ -1,6 +1,6 @@
 """Prims that the USD files of hands and objects share."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
 import numpy as np
@@ -19,7 +19,7 @@ def define_root(stage: Usd.Stage, name: str) -> Usd.Prim:
 
 
 def define_body(
-    prim: Usd.Prim, mass: float, com: Sequence[float], moments: np.ndarray, axes: np.ndarray
+    prim: Usd.Prim, mass: float, com: Iterable[float], moments: np.ndarray, axes: np.ndarray
 ) -> None:
     """Make a prim a rigid body with a mass [kg], a centre [m], and moments [kg m^2] about it.
 

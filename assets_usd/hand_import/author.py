@@ -204,7 +204,7 @@ class Author:
         revolute = UsdPhysics.RevoluteJoint.Define(self.stage, path)
         prim = revolute.GetPrim()
         # UsdPhysics knows axes x, y and z alone: both frames turn until x is the axis.
-        turn = Rotation.align_vectors([joint.axis], [[1.0, 0.0, 0.0]])[0].asusd_quaternion()
+        turn = Rotation.align_vectors([joint.axis], [[1.0, 0.0, 0.0]])[0].as_quat()
         turned = np.array([0.0, 0.0, 0.0, *turn])
         parent_frame = compose(joint.parent_frame, turned)
         child_frame = compose(joint.child_frame, turned)

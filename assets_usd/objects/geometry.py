@@ -166,7 +166,7 @@ def distances(surface: Surface, points: np.ndarray) -> np.ndarray:
     result = wp.zeros((1, len(points)), dtype=float, device="cpu")
     number = wp.array([mesh.id], dtype=wp.uint64, device="cpu")
     wp.launch(off_mesh_kernel, result.shape, [places, number], [result], device="cpu")
-    return np.ptp(surface.vertices, axis=0).max() * np.asarray(result.numpy()[0])
+    return np.asarray(np.ptp(surface.vertices, axis=0).max() * result.numpy()[0])
 
 
 def sides_along_axes(points: np.ndarray) -> np.ndarray:
