@@ -203,7 +203,7 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         family="imported",
         split=job.split,
         scale=scale,
-        volume_error=parts.error + body.volume / body.solid.volume - 1.0,  # parts are full
+        volume_error=parts.error + (body.volume / body.solid.volume - 1.0),  # parts are full
         volume_method=(
             f"{parts.method}; volume in which parts and solid differ; solid: {body.method}"
         ),
