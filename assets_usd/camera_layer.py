@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import CameraModel, HandError, HandModel
 from vd.assets_usd.hand_layer import author, new_layer, open_layer, save_layer
 from vd.assets_usd.hand_model import OPTICAL_FROM_USD
+from vd.assets_usd.usd_prims import numpy_quaternion, usd_quaternion
 
 CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
 """What ``customLayerData`` of a layer says it is."""
@@ -42,9 +43,9 @@ def write_camera_layer(
     text = f"Place of the depth camera of {hand.name}, a layer over the hand."
     layer = new_layer(hand.name, text, {"format": CAMERA_LAYER_FORMAT, **notes})
     camera = Sdf.CreatePrimInLayer(layer, f"/{hand.name}/base/camera")
-    x, y, z, w = (Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD.inv()).as_quat()
+    turn = Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD.inv()
     author(camera, "xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(*pose[:3]))
-    author(camera, "xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(w, x, y, z))
+    author(camera, "xformOp:orient", Sdf.ValueTypeNames.Quatd, usd_quaternion(turn.as_quat()))
     save_layer(layer, path)
 
 
@@ -83,5 +84,5 @@ def read_camera_pose(hand: HandModel, layer: Path) -> np.ndarray:
         raise HandError(f"{layer} is of {opened.defaultPrim}, not of {hand.name}")
     place = opened.GetAttributeAtPath(f"{camera}.xformOp:translate").default
     turn = opened.GetAttributeAtPath(f"{camera}.xformOp:orient").default
-    optical = Rotation.from_quat([*turn.imaginary, turn.real]) * OPTICAL_FROM_USD
+    optical = Rotation.from_quat(numpy_quaternion(turn)) * OPTICAL_FROM_USD
     return np.array([*place, *optical.as_quat()])

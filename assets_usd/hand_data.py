@@ -422,14 +422,3 @@ def invert(pose: np.ndarray) -> np.ndarray:
     """The inverse of one pose [7]."""
     turn = Rotation.from_quat(pose[3:]).inv()
     return np.concatenate([-turn.apply(pose[:3]), turn.as_quat()])
-
-
-def canonical_quat(quat: np.ndarray) -> np.ndarray:
-    """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive.
-
-    Xyzw [4].
-    """
-    for value in (quat[3], *quat[:3]):
-        if value != 0.0:
-            return -quat if value < 0.0 else quat
-    return quat

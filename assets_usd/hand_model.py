@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
@@ -36,6 +35,7 @@ from vd.assets_usd.hand_data import (
 from vd.assets_usd.hand_layer import add_layer, read_servo
 from vd.assets_usd.objects.geometry import Surface
 from vd.assets_usd.objects.usd_mesh import mesh_triangles
+from vd.assets_usd.usd_prims import numpy_quaternion
 from vd.kernels.servo.actuators import MAX_JOINTS
 
 __all__ = [
@@ -341,7 +341,9 @@ class _Reader:
                 f"'physics:diagonalInertia' is {moments}",
                 "three positive moments, none above the sum of two",
             )
-        axes = Rotation.from_quat(xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
+        axes = Rotation.from_quat(
+            numpy_quaternion(self.value(body, "physics:principalAxes"))
+        ).as_matrix()
         return {
             "link_mass": self.number(body, "physics:mass", positive=True),
             "link_com": self.vector(body, "physics:centerOfMass"),
@@ -392,7 +394,9 @@ class _Reader:
 
     def _pose(self, prim: Usd.Prim, position: str, rotation: str) -> np.ndarray:
         """A pose in two attributes [7]."""
-        return np.concatenate([self.vector(prim, position), xyzw(self.value(prim, rotation))])
+        return np.concatenate(
+            [self.vector(prim, position), numpy_quaternion(self.value(prim, rotation))]
+        )
 
     def _joined_links(self, joint: Usd.Prim, index: dict[Sdf.Path, int]) -> tuple[int, int]:
         """Parent and child of a joint, which its name says."""
@@ -579,9 +583,3 @@ class _Reader:
 def _bodies(joint: Usd.Prim, side: int) -> list[Sdf.Path]:
     """What a joint joins on its first (0) or second side."""
     return list(joint.GetRelationship(f"physics:body{side}").GetTargets())
-
-
-def xyzw(quaternion: Gf.Quatf) -> np.ndarray:
-    """A USD quaternion as a unit quaternion xyzw [4], in double precision."""
-    components = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], dtype=float)
-    return np.asarray(components / np.linalg.norm(components))

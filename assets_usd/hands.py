@@ -3,6 +3,7 @@
 Of this package, imported, or USD files.
 """
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,10 +58,10 @@ def called(hand: "HandModel") -> str:
 
     Its name, or its file if no hand of that name is this one.
     """
-    try:
-        return hand.name if hand_usd(hand.name).samefile(hand.path) else str(hand.path.resolve())
-    except ValueError:
-        return str(hand.path.resolve())
+    with suppress(ValueError):
+        if hand_usd(hand.name).samefile(hand.path):
+            return hand.name
+    return str(hand.path.resolve())
 
 
 def root_name(hand: str) -> str:

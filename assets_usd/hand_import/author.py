@@ -14,7 +14,6 @@ from trimesh.util import append_faces
 from vd.assets_usd.hand_data import (
     MOTOR_ATTRIBUTES,
     MotorModel,
-    canonical_quat,
     compose,
     invert,
     motor_attribute,
@@ -32,7 +31,7 @@ from vd.assets_usd.objects.geometry import (
     simplify_hull,
     surface_points,
 )
-from vd.assets_usd.objects.model import add_mesh
+from vd.assets_usd.usd_prims import add_mesh, define_body, define_root, usd_quaternion
 
 HULL_VERTICES = 32
 """Most corners of a collider: contacts of more take longer and feel the same."""
@@ -53,7 +52,7 @@ class Author:
         self.said = said
         self.names = ["base"]
         self.joints = []
-        for finger, joints in enumerate(tree.finger_joints()):
+        for finger, joints in enumerate(tree.fingers):
             self.names += [f"f{finger}_l{i + 1}" for i in range(len(joints))]
             self.joints += [f"f{finger}_j{i + 1}" for i in range(len(joints))]
         self.root = f"/{name}"
@@ -61,11 +60,7 @@ class Author:
         self.meshes = Sdf.Layer.CreateAnonymous(".usdc")
         self.layer.subLayerPaths.append(self.meshes.identifier)
         self.stage = stage = Usd.Stage.Open(self.layer)
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
-        root = UsdGeom.Xform.Define(stage, self.root).GetPrim()
-        stage.SetDefaultPrim(root)
+        root = define_root(stage, name)
         root.SetDocumentation(f"{name}, imported from {self.tree.source}")
         UsdPhysics.ArticulationRootAPI.Apply(root)
         self._describe(root)
@@ -75,8 +70,8 @@ class Author:
             self._link(number, link, poses[number])
         for number, joint in enumerate(self.tree.joints):
             self._joint(number, joint)
-        for finger, joints in enumerate(self.tree.finger_joints()):
-            at = f"{self.root}/{self.names[joints[-1] + 1]}/f{finger}_tip"
+        for finger, joints in enumerate(self.tree.fingers):
+            at = f"{self.root}/{self.names[joints.stop]}/f{finger}_tip"
             site = UsdGeom.Sphere.Define(stage, at)
             site.CreateRadiusAttr(0.001)
             site.CreatePurposeAttr(UsdGeom.Tokens.guide)
@@ -108,7 +103,7 @@ class Author:
         place = stance.workspace
         kinds = Sdf.ValueTypeNames
         _custom(root, "vd:mount:position", kinds.Double3, Gf.Vec3d(*stance.mount[:3]))
-        _custom(root, "vd:mount:orientation", kinds.Quatd, _quat(stance.mount[3:]))
+        _custom(root, "vd:mount:orientation", kinds.Quatd, usd_quaternion(stance.mount[3:]))
         _custom(root, "vd:palm", kinds.Double3, Gf.Vec3d(*stance.palm))
         _custom(root, "vd:workspace:drop", kinds.Double3, Gf.Vec3d(*place.drop_m))
         _custom(root, "vd:workspace:goal", kinds.Double3, Gf.Vec3d(*place.goal_m))
@@ -134,13 +129,7 @@ class Author:
         _place(xform, pose)
         prim = xform.GetPrim()
         _custom(prim, "vd:source", Sdf.ValueTypeNames.String, link.name)
-        UsdPhysics.RigidBodyAPI.Apply(prim)
-        moments, quaternion = principal_axes(link.inertia)
-        mass = UsdPhysics.MassAPI.Apply(prim)
-        mass.CreateMassAttr(link.mass)
-        mass.CreateCenterOfMassAttr(Gf.Vec3f(*link.com))
-        mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments))
-        mass.CreatePrincipalAxesAttr(Gf.Quatf(_quat(quaternion)))
+        define_body(prim, link.mass, link.com, *principal_axes(link.inertia))
         UsdGeom.Scope.Define(self.stage, f"{path}/collision").CreatePurposeAttr(
             UsdGeom.Tokens.guide
         )
@@ -157,8 +146,8 @@ class Author:
 
     def _is_tip(self, number: int, shape: Shape, colliders: list[Shape]) -> bool:
         """Whether a collider is the nearest to a fingertip on its link."""
-        for joints, tip in zip(self.tree.finger_joints(), self.stance.tips, strict=True):
-            if joints[-1] + 1 == number:
+        for joints, tip in zip(self.tree.fingers, self.stance.tips, strict=True):
+            if joints.stop == number:
                 distance = [_distance(other, tip[:3]) for other in colliders]
                 return _distance(shape, tip[:3]) <= min(distance) + 1e-4
         return False
@@ -223,9 +212,9 @@ class Author:
         revolute.CreateBody0Rel().SetTargets([f"{self.root}/{self.names[joint.parent]}"])
         revolute.CreateBody1Rel().SetTargets([f"{self.root}/{self.names[joint.child]}"])
         revolute.CreateLocalPos0Attr(Gf.Vec3f(*parent_frame[:3]))
-        revolute.CreateLocalRot0Attr(Gf.Quatf(_quat(parent_frame[3:])))
+        revolute.CreateLocalRot0Attr(Gf.Quatf(usd_quaternion(parent_frame[3:])))
         revolute.CreateLocalPos1Attr(Gf.Vec3f(*child_frame[:3]))
-        revolute.CreateLocalRot1Attr(Gf.Quatf(_quat(child_frame[3:])))
+        revolute.CreateLocalRot1Attr(Gf.Quatf(usd_quaternion(child_frame[3:])))
         revolute.CreateLowerLimitAttr(float(np.degrees(joint.lower)))
         revolute.CreateUpperLimitAttr(float(np.degrees(joint.upper)))
         drive = UsdPhysics.DriveAPI.Apply(prim, "angular")
@@ -303,13 +292,8 @@ def _float(prim: Usd.Prim, name: str, value: float) -> None:
     prim.CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False).Set(float(value))
 
 
-def _quat(xyzw: np.ndarray) -> Gf.Quatd:
-    x, y, z, w = map(float, canonical_quat(np.asarray(xyzw, dtype=float)))
-    return Gf.Quatd(w, x, y, z)
-
-
 def _place(xform: UsdGeom.Xformable, pose: np.ndarray, scale: np.ndarray | None = None) -> None:
     xform.AddTranslateOp().Set(Gf.Vec3d(*pose[:3]))
-    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_quat(pose[3:]))
+    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(usd_quaternion(pose[3:]))
     if scale is not None:
         xform.AddScaleOp().Set(Gf.Vec3f(*scale))

@@ -19,8 +19,6 @@ from vd.assets_usd.hand_import.tree import Tree, shape_box
 
 FULL_TORQUE_RAD = 0.3
 """Error at which a guessed gain reaches the torque limit: of a small servo's position mode."""
-DAMPING_RATIO = 1.0
-"""Guessed damping over the critical one, of what a joint turns."""
 SPEED_RAD_S = 8.0
 ARMATURE_KG_M2 = 0.001
 """Of a Dynamixel of 50 g."""
@@ -36,8 +34,6 @@ SIZES = (0.35, 0.8)
 """Smallest and largest object for the mean length of the fingers."""
 DROP_M = 0.01
 """Height of the drop point over the goal."""
-FALL = 1.0
-"""Distance at which an object is lost, likewise."""
 
 
 @dataclass
@@ -69,7 +65,7 @@ def stand(
     tree: Tree, tips: list[np.ndarray], start: np.ndarray, palm: np.ndarray, said: Description
 ) -> tuple[np.ndarray, Workspace]:
     """Mount and workspace of a hand at a start [D]; what is guessed goes into the tree's notes."""
-    ends = _roots(tree), _tip_points(tree, tips, start)
+    ends = roots(tree), tip_points(tree, tips, start)
     if said.mount is not None:
         quaternion = np.array(said.mount.quaternion) / np.linalg.norm(said.mount.quaternion)
         mount = np.array([*said.mount.position, *quaternion])
@@ -96,7 +92,7 @@ def _complete_drives(tree: Tree, start: np.ndarray) -> None:
     _fill(tree, "kp", [joint.effort / FULL_TORQUE_RAD for joint in tree.joints])
     damping = []
     for joint, critical in zip(tree.joints, critical_damping(tree, start), strict=True):
-        damping.append(max(DAMPING_RATIO * critical, joint.damping))
+        damping.append(max(critical, joint.damping))
         joint.kd += joint.damping
     _fill(tree, "kd", damping)
 
@@ -122,14 +118,15 @@ def critical_damping(tree: Tree, q: np.ndarray) -> np.ndarray:
         Damping of each drive [D] [N m s/rad].
     """
     moves = np.eye(len(tree.joints))
+    mass = _mass_matrix(tree, q)
+    kp = np.zeros(len(tree.joints))
     for i, joint in enumerate(tree.joints):
+        mass[i, i] += joint.armature
+        kp[i] = joint.kp
         if joint.mimic is not None:
             moves[i, i] = 0.0
             moves[i, tree.leader(joint)] = joint.mimic[1]
-    armature = np.array([joint.armature for joint in tree.joints])
-    inertia = ((_mass_matrix(tree, q) + np.diag(armature)) @ moves * moves).sum(axis=0)
-    kp = np.array([joint.kp for joint in tree.joints])
-    return np.asarray(2.0 * np.sqrt(kp * inertia))
+    return np.asarray(2.0 * np.sqrt(kp * (mass @ moves * moves).sum(axis=0)))
 
 
 def _mass_matrix(tree: Tree, q: np.ndarray) -> np.ndarray:
@@ -157,9 +154,9 @@ def _mass_matrix(tree: Tree, q: np.ndarray) -> np.ndarray:
 def _tips(tree: Tree) -> list[np.ndarray]:
     """Fingertips; of fingers without a mark the middle of an end of a box, farthest from the last joint."""
     tips = []
-    for joints, marked in zip(tree.finger_joints(), tree.tips, strict=True):
+    for joints, marked in zip(tree.fingers, tree.tips, strict=True):
         if marked is None:
-            link = tree.links[joints[-1] + 1]
+            link = tree.links[joints.stop]
             marked = pose_at(_farthest(link, tree.joints[joints[-1]]))
             where = _text(marked[:3])
             tree.notes.append(
@@ -185,15 +182,15 @@ def _farthest(link: Link, joint: Joint) -> np.ndarray:
 
 def _start(tree: Tree, said: Description) -> np.ndarray:
     """The pose that is described; elsewhere open: zero, or the limit nearest to it."""
-    angles = np.clip(np.zeros(len(tree.joints)), *_limits(tree))
+    lower, upper = _limits(tree)
+    angles = np.clip(0.0, lower, upper)
     for i, joint in enumerate(tree.joints):
         angles[i] = said.start.get(joint.name, angles[i])
     if not said.start:
         tree.notes.append(
             "guess: starts with all joints at zero, or their limit nearest to it (start)"
         )
-
-    return np.clip(tree.followed(angles), *_limits(tree))
+    return np.clip(tree.followed(angles), lower, upper)
 
 
 def _limits(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
@@ -203,16 +200,16 @@ def _limits(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def _tip_points(tree: Tree, tips: list[np.ndarray], q: np.ndarray) -> np.ndarray:
+def tip_points(tree: Tree, tips: list[np.ndarray], q: np.ndarray) -> np.ndarray:
     """Fingertips in the base [F, 3]."""
     poses = tree.forward_kinematics(q)
-    last = [joints[-1] + 1 for joints in tree.finger_joints()]
+    last = [joints.stop for joints in tree.fingers]
     return compose(poses[last], np.stack(tips))[:, :3]
 
 
-def _roots(tree: Tree) -> np.ndarray:
+def roots(tree: Tree) -> np.ndarray:
     """First joints of the fingers in the base [F, 3]."""
-    return np.stack([tree.joints[joints[0]].parent_frame[:3] for joints in tree.finger_joints()])
+    return np.stack([tree.joints[joints[0]].parent_frame[:3] for joints in tree.fingers])
 
 
 def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
@@ -223,26 +220,22 @@ def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
     if said.palm is not None:
         return np.array(said.palm) / np.linalg.norm(said.palm)
     lower, upper = _limits(tree)
-    open_q = tree.followed(np.clip(np.zeros(len(lower)), lower, upper))
+    open_q = tree.followed(np.clip(0.0, lower, upper))
     wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
     one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
     bent_q = tree.followed(np.where(one_sided, open_q + BENT * (wider - open_q), open_q))
-    opened = _tip_points(tree, tips, open_q)
-    bent = _tip_points(tree, tips, bent_q)
-    along = opened - _roots(tree)
+    opened = tip_points(tree, tips, open_q)
+    along = opened - roots(tree)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    ways = bent - opened
+    ways = tip_points(tree, tips, bent_q) - opened
     ways -= np.sum(ways * along, axis=1, keepdims=True) * along
     length = np.linalg.norm(ways, axis=1).mean()
-    claw = length < 1e-4 or np.linalg.norm(ways.mean(axis=0)) < TOGETHER * length
-    palm = along.mean(axis=0) if claw else ways.mean(axis=0)
-    palm /= np.linalg.norm(palm)
-    palm = _snapped(palm)
-    reason = (
-        "where the fingers point, as of a claw"
-        if claw
-        else "where the tips go when the fingers bend"
-    )
+    palm = ways.mean(axis=0)
+    reason = "where the tips go when the fingers bend"
+    if length < 1e-4 or np.linalg.norm(palm) < TOGETHER * length:
+        palm = along.mean(axis=0)
+        reason = "where the fingers point, as of a claw"
+    palm = _snapped(palm / np.linalg.norm(palm))
     tree.notes.append(f"guess: the palm looks along {_text(palm)} of the base, {reason} (palm)")
     return palm
 
@@ -302,7 +295,7 @@ def _workspace(
     goal = placed(mount, middle + above * palm)
     x, y, z = said.goal or map(float, goal)
     drop = said.drop or (x, y, z + DROP_M)
-    fall = said.fall or FALL * reach
+    fall = said.fall or reach  # the mean length of the fingers
     for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": (fall,)}.items():
         if getattr(said, name) is None:
             tree.notes.append(f"guess: {name} {_text(np.array(value))} m (workspace)")

@@ -14,7 +14,14 @@ from vd.assets_usd.hand_data import HandError, HandModel, compose
 from vd.assets_usd.hand_import.author import Author
 from vd.assets_usd.hand_import.bowl import OBJECTS, add_shape, find_bowl
 from vd.assets_usd.hand_import.description import BUILT_IN, Description, read_description
-from vd.assets_usd.hand_import.guess import Stance, critical_damping, stand, take_stance
+from vd.assets_usd.hand_import.guess import (
+    Stance,
+    critical_damping,
+    roots,
+    stand,
+    take_stance,
+    tip_points,
+)
 from vd.assets_usd.hand_import.source import Source, read_source
 from vd.assets_usd.hand_import.tree import Tree, grow
 from vd.assets_usd.hand_model import open_stage, read_hand
@@ -149,10 +156,8 @@ def _replaced(path: Path, source: Source) -> list[str]:
 
 def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
     """Refuse a hand that is no hand in metres."""
-    poses = tree.forward_kinematics(stance.start)
-    for joints, tip in zip(tree.finger_joints(), stance.tips, strict=True):
-        root = tree.joints[joints[0]].parent_frame[:3]
-        reach = float(np.linalg.norm(compose(poses[joints[-1] + 1], tip)[:3] - root))
+    ends = tip_points(tree, stance.tips, stance.start)
+    for joints, reach in zip(tree.fingers, np.linalg.norm(ends - roots(tree), axis=1), strict=True):
         if not REACH_M[0] <= reach <= REACH_M[1]:
             raise HandError(
                 f"{source.path}: the finger of {tree.joints[joints[0]].name} is {reach:.3g} m "
@@ -241,8 +246,8 @@ def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
         for i, link in enumerate(tree.links):
             if i != joint.child and link.name == tree.links[joint.parent].name:
                 pairs.add((min(i, joint.child), max(i, joint.child)))
-    for joints in tree.finger_joints():
-        pairs |= set(combinations([joint + 1 for joint in joints], 2))
+    for joints in tree.fingers:
+        pairs |= set(combinations(range(joints.start + 1, joints.stop + 1), 2))
     for names in source.apart:
         first, second = sorted(number.get(name, 0) for name in names)
         if first != second:

@@ -3,7 +3,6 @@
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -44,7 +43,7 @@ class Tree:
     """Welded; of each the frame is that of the source's link that moves."""
     joints: list[Joint] = field(default_factory=list)
     """Parents and children count in ``links``; joint i moves link i + 1."""
-    counts: list[int] = field(default_factory=list)
+    fingers: list[range] = field(default_factory=list)
     """Joints of each finger."""
     tips: list[np.ndarray | None] = field(default_factory=list)
     """Fingertip in the last link of each finger [7], where the source marks one."""
@@ -66,11 +65,6 @@ class Tree:
         for joint, angle in zip(self.joints, q, strict=True):
             poses.append(compose(poses[joint.parent], joint_pose(joint, angle)))
         return np.stack(poses)
-
-    def finger_joints(self) -> list[range]:
-        """Joints of each finger."""
-        ends = np.cumsum([0, *self.counts]).tolist()
-        return [range(first, end) for first, end in pairwise(ends)]
 
     def followed(self, q: np.ndarray) -> np.ndarray:
         """Angles with those joints where they are led that follow others [D]."""
@@ -107,9 +101,11 @@ class _Grower:
         self.problems = list(source.problems)
         self.warnings: list[str] = []
         self.by_name = {joint.name: joint for joint in source.joints}
-        self.out: dict[int, list[int]] = {}
-        for number, joint in enumerate(source.joints):
-            self.out.setdefault(joint.parent, []).append(number)
+        self.out: dict[int, list[Joint]] = defaultdict(list)
+        self.above: dict[int, Joint] = {}
+        for joint in source.joints:
+            self.out[joint.parent].append(joint)
+            self.above[joint.child] = joint
         self.held: dict[str, float] = dict(said.hold)
         self.raised: list[str] = []
         self.hollow: dict[str, float] = {}
@@ -117,8 +113,8 @@ class _Grower:
     def fail(self) -> None:
         """Raise what was found, if anything."""
         if self.problems:
-            text = "\n".join(f"  - {problem}" for problem in dict.fromkeys(self.problems))
-            raise HandError(f"{self.source.path}: cannot be imported:\n{text}")
+            text = "\n  - ".join(dict.fromkeys(self.problems))
+            raise HandError(f"{self.source.path}: cannot be imported:\n  - {text}")
 
     def grow(self) -> Tree:
         self._check_names()
@@ -154,7 +150,7 @@ class _Grower:
 
     def _add_finger(self, tree: Tree, chain: list[Joint], copies: Counter[str]) -> None:
         """Put the joints of a finger into a tree, and the links that they move."""
-        tree.counts.append(len(chain))
+        tree.fingers.append(range(len(tree.joints), len(tree.joints) + len(chain)))
         if len(chain) > MAX_JOINTS:
             self.problems.append(
                 f"the finger of {chain[0].name} has {len(chain)} joints; hold some of them"
@@ -271,8 +267,7 @@ class _Grower:
         poses = {first: IDENTITY}
         queue = [first]
         for link in queue:
-            for number in self.out.get(link, ()):
-                joint = self.source.joints[number]
+            for joint in self.out[link]:
                 if self._is_welded(joint):
                     angle = self.held.get(joint.name, 0.0) if joint.kind == "revolute" else 0.0
                     poses[joint.child] = compose(poses[link], joint_pose(joint, angle))
@@ -281,9 +276,8 @@ class _Grower:
 
     def _first(self, link: int) -> int:
         """The link with whose frame a link moves."""
-        parents = {joint.child: joint for joint in self.source.joints}
-        while link in parents and self._is_welded(parents[link]):
-            link = parents[link].parent
+        while link in self.above and self._is_welded(self.above[link]):
+            link = self.above[link].parent
         return link
 
     def _leaving(self, first: int) -> list[Joint]:
@@ -294,8 +288,7 @@ class _Grower:
 
     def _palm(self) -> tuple[int, list[Joint]]:
         """The root and the first joints of the fingers; joints of a wrist become held."""
-        children = {joint.child for joint in self.source.joints}
-        roots = [i for i in range(len(self.source.links)) if i not in children]
+        roots = [i for i in range(len(self.source.links)) if i not in self.above]
         base = max(roots, key=self._moving)
         for root in roots:
             if root != base:
@@ -325,8 +318,7 @@ class _Grower:
     def _moving(self, link: int) -> int:
         """Joints that move below a link."""
         count = 0
-        for number in self.out.get(link, ()):
-            joint = self.source.joints[number]
+        for joint in self.out[link]:
             count += self._moving(joint.child) + (not self._is_welded(joint))
         return count
 
@@ -481,8 +473,8 @@ class _Grower:
                 f"or drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no "
                 "motor"
             )
-        for joints in tree.finger_joints():
-            link = tree.links[joints[-1] + 1]
+        for joints in tree.fingers:
+            link = tree.links[joints.stop]
             if not link.colliders:
                 self.problems.append(
                     f"nothing collides of {link.name}, which has a fingertip; add a collision"

@@ -15,7 +15,6 @@ from vd.assets_usd.objects.geometry import (
     distances,
     inside,
     joined,
-    mesh_volume,
     solid_of_mesh,
     union_depth,
 )
@@ -106,7 +105,8 @@ def _near(surface: Surface, distance: float, points: np.ndarray) -> np.ndarray:
 def _open_share(surface: Surface) -> float:
     """Volume in which it is unclear what is inside, as a share of what is inside."""
     points, _ = _points_around(surface.vertices)
-    low, high = (inside(surface, points, level) for level in OPEN_LEVELS)
+    low = inside(surface, points, OPEN_LEVELS[0])
+    high = inside(surface, points, OPEN_LEVELS[1])
     return float((low & ~high).sum() / max(high.sum(), 1))
 
 
@@ -168,10 +168,3 @@ def error_of_parts(body: Body, vertices: np.ndarray) -> Callable[[Sequence[Hull]
         return float((within != covered).mean() * box / body.volume)
 
     return error
-
-
-def cavity_share(mesh: RepairedMesh, body: Body) -> float:
-    """Volume of a mesh's cavities as a share of its solid's."""
-    if not len(mesh.cavities.faces):
-        return 0.0
-    return -mesh_volume(*mesh.cavities) / body.solid.volume

@@ -20,7 +20,6 @@ from vd.assets_usd.objects.geometry import (
     Surface,
     convex_hull,
     hull_volume,
-    mesh_volume,
     sides_along_axes,
     simplify_hull,
 )
@@ -48,7 +47,7 @@ FINE_HULLS = 96
 """Factor on the threshold, and most parts, of the fine decomposition from which parts are merged
 where the first is not good."""
 
-MERGED_HULLS = (8, 12, 16, 24, 32)
+MERGED_HULLS = (32, 24, 16, 12, 8)
 """Numbers of parts to which a fine decomposition is merged. What is thin or a ring needs 16 and
 more.
 """
@@ -73,7 +72,7 @@ class Decomposition:
 
     hulls: tuple[Hull, ...]
     method: str
-    fallback: tuple[str, ...] = ()
+    fallback: str = ""
     error: float = 0.0
 
 
@@ -91,7 +90,7 @@ def _coacd_parts(surface: Surface, settings: ImportSettings, max_vertices: int) 
         max_ch_vertex=max_vertices,
         seed=0,
     )
-    return [np.asarray(v, dtype=np.float64) for v, _ in parts]
+    return [vertices for vertices, _ in parts]
 
 
 def _limited(parent: int, seconds: float) -> None:
@@ -125,18 +124,13 @@ def _parts_or_reason(seconds: float, *arguments: Any) -> list[np.ndarray] | str:
 def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ...]:
     """Convex hulls of parts, without slivers, each of at most ``max_vertices`` vertices."""
     size = float(np.ptp(np.concatenate(parts), axis=0).max())
-    hulls = []
-    for part in parts:
-        try:
-            hulls.append(convex_hull(part))
-        except ValueError:
-            continue
-    volumes = np.array([mesh_volume(*h) for h in hulls])
+    volumes = np.array(list(map(hull_volume, parts)))
     kept = []
-    for hull, volume in zip(hulls, volumes, strict=True):
-        thickness = sides_along_axes(hull.vertices).min()
-        if volume > SLIVER_VOLUME * volumes.sum() and thickness > SLIVER_THICKNESS * size:
-            kept.append(simplify_hull(hull, max_vertices))
+    for part, volume in zip(parts, volumes, strict=True):
+        if volume > SLIVER_VOLUME * volumes.sum():
+            hull = convex_hull(part)
+            if sides_along_axes(hull.vertices).min() > SLIVER_THICKNESS * size:
+                kept.append(simplify_hull(hull, max_vertices))
     return tuple(kept)
 
 
@@ -157,9 +151,8 @@ def decompose(
     elif hulls := tidy_hulls(parts, max_vertices):
         return Decomposition(hulls, "coacd")
     hull = simplify_hull(convex_hull(surface.vertices), max_vertices)
-    return Decomposition(
-        (hull,), "one hull", (f"coacd failed: {why}", "one convex hull stands for the whole mesh")
-    )
+    why = f"coacd failed: {why}; one convex hull stands for the whole mesh"
+    return Decomposition((hull,), "one hull", why)
 
 
 def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
@@ -215,15 +208,13 @@ def best_decomposition(
     limits = replace(settings, max_hulls=FINE_HULLS, threshold=threshold)
     fine = decompose(surface, limits, 2 * HULL_VERTICES)
     if fine.fallback:
-        return replace(first, fallback=("no finer parts", *fine.fallback))
+        return replace(first, fallback=f"no finer parts; {fine.fallback}")
     candidates = [first]
     parts = [hull.vertices for hull in fine.hulls]
-    for most in sorted((n for n in MERGED_HULLS if n <= settings.max_hulls), reverse=True):
-        parts = merge_parts(parts, most)
-        hulls = tidy_hulls(parts, HULL_VERTICES)
-        candidates.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
+    for most in MERGED_HULLS:
+        if most <= settings.max_hulls:
+            parts = merge_parts(parts, most)
+            hulls = tidy_hulls(parts, HULL_VERTICES)
+            candidates.append(Decomposition(hulls, "coacd, merged", error=error_of(hulls)))
     enough = max(GOOD_ERROR, NEARLY * min(candidate.error for candidate in candidates))
-    return min(
-        (candidate for candidate in candidates if candidate.error <= enough),
-        key=lambda candidate: (len(candidate.hulls), candidate.error),
-    )
+    return min(candidates, key=lambda each: (each.error > enough, len(each.hulls), each.error))

@@ -84,19 +84,17 @@ def convex_hull(points: np.ndarray) -> Hull:
         points: [n, 3], at least four of them not in one plane.
 
     Raises:
-        ValueError: The points are flat or fewer than four.
+        ValueError: There is no such four of them.
     """
     points = np.asarray(points, dtype=np.float64)
-    if len(points) < 4:
-        raise ValueError(f"a convex hull needs four points, got {len(points)}")
     try:
         hull = ConvexHull(points)
     except QhullError as error:
         raise ValueError("the points lie in one plane") from error
-    normal = _normals(Surface(points, hull.simplices))
-    inward = np.einsum("ij,ij->i", normal, hull.equations[:, :3]) < 0.0
-    simplices = hull.simplices.copy()
-    simplices[inward] = simplices[inward][:, ::-1]
+    simplices = hull.simplices
+    normal = _normals(Surface(points, simplices))
+    inward = (normal * hull.equations[:, :3]).sum(axis=1) < 0.0
+    simplices[inward] = simplices[inward, ::-1]
     used, faces = np.unique(simplices, return_inverse=True)
     return Hull(points[used], faces.reshape(-1, 3).astype(np.int32))
 
@@ -111,14 +109,13 @@ def hull_volume(points: np.ndarray) -> float:
 
 def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
     """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
-    normal = _normals(hull)
-    length = np.linalg.norm(normal, axis=1)
-    keep = length > 1e-12 * length.max()
-    normal = normal[keep] / length[keep, None]
-    offset = np.einsum("ij,ij->i", normal, _corners(hull)[0, keep])
-    points = np.asarray(points, dtype=np.float64)
-    chunks = np.array_split(points, 1 + len(points) * len(offset) // MOST_DISTANCES)
-    return np.concatenate([(chunk @ normal.T - offset).max(axis=1) for chunk in chunks])
+    planes = ConvexHull(hull.vertices).equations
+    depth = np.zeros(len(points))
+    rows = 1 + MOST_DISTANCES // len(planes)
+    for first in range(0, len(points), rows):
+        chunk = slice(first, first + rows)
+        depth[chunk] = (points[chunk] @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+    return depth
 
 
 def union_depth(hulls: Sequence[Hull], points: np.ndarray) -> np.ndarray:
@@ -135,24 +132,16 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
-class _QueriedMesh:
-    """A mesh on the processor, of unit length, that Warp's kernels ask."""
+def _queried(surface: Surface, points: np.ndarray, *, winding: bool = False) -> Any:
+    """A mesh of unit length on the processor, and points [.., 3] in its frame, for kernels."""
+    import warp as wp
 
-    def __init__(self, surface: Surface, *, winding: bool = False):
-        import warp as wp
-
-        self.low = surface.vertices.min(axis=0)
-        self.size = float(np.ptp(surface.vertices, axis=0).max())
-        indices = wp.array(surface.faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-        corners = self.placed(surface.vertices)
-        self.mesh = wp.Mesh(corners, indices, support_winding_number=winding)
-
-    def placed(self, points: np.ndarray) -> Any:
-        """Points [.., 3] in its frame, as an array of vectors."""
-        import warp as wp
-
-        scaled = (points - self.low) / self.size
-        return wp.array(scaled.astype(np.float32), dtype=wp.vec3, device="cpu")
+    low = surface.vertices.min(axis=0)
+    size = np.ptp(surface.vertices, axis=0).max()
+    corners = wp.array((surface.vertices - low) / size, dtype=wp.vec3, device="cpu")
+    indices = wp.array(surface.faces.ravel(), dtype=wp.int32, device="cpu")
+    mesh = wp.Mesh(corners, indices, support_winding_number=winding)
+    return mesh, wp.array((points - low) / size, dtype=wp.vec3, device="cpu")
 
 
 def inside(surface: Surface, points: np.ndarray, level: float = 0.5) -> np.ndarray:
@@ -161,10 +150,9 @@ def inside(surface: Surface, points: np.ndarray, level: float = 0.5) -> np.ndarr
 
     from vd.kernels.sensor.winding import inside_kernel
 
-    queried = _QueriedMesh(surface, winding=True)
+    mesh, places = _queried(surface, points, winding=True)
     result = wp.zeros(len(points), dtype=wp.bool, device="cpu")
-    inputs = [queried.mesh.id, level, queried.placed(points)]
-    wp.launch(inside_kernel, result.shape, inputs, [result], device="cpu")
+    wp.launch(inside_kernel, result.shape, [mesh.id, level, places], [result], device="cpu")
     return np.asarray(result.numpy(), dtype=bool)
 
 
@@ -174,12 +162,11 @@ def distances(surface: Surface, points: np.ndarray) -> np.ndarray:
 
     from vd.kernels.sensor.shape_grids import off_mesh_kernel
 
-    queried = _QueriedMesh(surface)
+    mesh, places = _queried(surface, points[None])
     result = wp.zeros((1, len(points)), dtype=float, device="cpu")
-    number = wp.array([queried.mesh.id], dtype=wp.uint64, device="cpu")
-    inputs = [queried.placed(points[None]), number]
-    wp.launch(off_mesh_kernel, result.shape, inputs, [result], device="cpu")
-    return queried.size * np.asarray(result.numpy()[0])
+    number = wp.array([mesh.id], dtype=wp.uint64, device="cpu")
+    wp.launch(off_mesh_kernel, result.shape, [places, number], [result], device="cpu")
+    return np.asarray(np.ptp(surface.vertices, axis=0).max() * result.numpy()[0])
 
 
 def sides_along_axes(points: np.ndarray) -> np.ndarray:
@@ -215,14 +202,15 @@ def _tetrahedron(points: np.ndarray) -> list[int]:
 
     Each is the farthest from their mean, or the point, line or plane before.
     """
-    first = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
-    away = points - points[first]
-    second = int(np.argmax(np.linalg.norm(away, axis=1)))
-    axis = away[second] / np.linalg.norm(away[second])
-    third = int(np.argmax(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1)))
-    normal = np.cross(away[second], away[third])
-    fourth = int(np.argmax(np.abs(away @ normal)))
-    return [first, second, third, fourth]
+    away = points - points.mean(axis=0)
+    chosen = [int(np.argmax(np.linalg.norm(away, axis=1)))]
+    away = points - points[chosen[0]]
+    for _ in range(3):
+        distance = np.linalg.norm(away, axis=1)
+        chosen.append(int(np.argmax(distance)))
+        axis = away[chosen[-1]] / distance[chosen[-1]]
+        away = away - np.outer(away @ axis, axis)
+    return chosen
 
 
 def solid_of_mesh(surface: Surface) -> Solid:
@@ -272,14 +260,10 @@ def triangle_areas(surface: Surface) -> np.ndarray:
 def random_surface_points(surface: Surface, count: int, rng: np.random.Generator) -> np.ndarray:
     """Uniform random points on a surface, [count, 3]."""
     area = np.cumsum(triangle_areas(surface))
-    if not len(area) or area[-1] <= 0.0:
-        raise ValueError("the surface has no area")
     index = np.searchsorted(area, rng.uniform(0.0, area[-1], count))
-    u, v = rng.uniform(size=(2, count, 1))
-    flip = u + v > 1.0
-    u = np.where(flip, 1.0 - u, u)
-    v = np.where(flip, 1.0 - v, v)
-    a, b, c = _corners(surface)[:, np.minimum(index, len(area) - 1)]
+    share = rng.uniform(size=(2, count, 1))
+    u, v = np.where(share.sum(axis=0) > 1.0, 1.0 - share, share)
+    a, b, c = _corners(surface)[:, index]
     return a + u * (b - a) + v * (c - a)
 
 
@@ -331,11 +315,6 @@ def cluster_vertices(surface: Surface, max_faces: int, *, closed: bool = False) 
     faces = surface.faces
     if len(faces) <= max_faces:
         return Surface(vertices, faces)
-    if len(vertices) > len(faces):  # corners of their own: those at one place become one
-        cell, faces = _clustered(surface, FINEST_GRID, closed=closed)
-        kept = np.zeros(cell.max() + 1, dtype=int)
-        kept[cell] = np.arange(len(cell))
-        vertices = vertices[kept]
     surface = Surface(vertices, faces)
     fine = FINEST_GRID
     coarse = COARSEST_GRID

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from vd.assets_usd.objects.bodies import body_of, cavity_share, error_of_parts
+from vd.assets_usd.objects.bodies import body_of, error_of_parts
 from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
     HULL_VERTICES,
@@ -123,18 +123,19 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
     Raises:
         MeshError: They are too far from the mesh.
     """
-    words = "; ".join(parts.fallback)
-    count = len(parts.hulls)
-    which = f"{count} convex parts differ" if count > 1 else "one convex part differs"
-    off = f"{which} from the mesh by {100 * parts.error:.0f} % of its volume"
-    advice = "thicken its walls, or allow finer parts (--threshold, --max-hulls)"
+    off = (
+        f"convex parts ({len(parts.hulls)}) differ from the mesh by {100 * parts.error:.0f} % of "
+        f"its volume, {100 * offset:.0f} % of its length off its surface on average: thicken its "
+        "walls, or allow finer parts (--threshold, --max-hulls)"
+    )
+    warnings = []
+    if parts.fallback:
+        warnings = [f"fall-back, tried again at the next import: {parts.fallback}"]
     if parts.error > MAX_ERROR and offset > MAX_OFFSET:
-        raise MeshError(
-            f"{off}, {100 * offset:.0f} % of its length off its surface on average"
-            f"{f' ({words})' if words else ''}: {advice}"
-        )
-    warnings = [f"fall-back, tried again at the next import: {words}"] if words else []
-    return warnings + ([f"{off}: {advice}"] if parts.error > GOOD_ERROR else [])
+        raise MeshError("; ".join([off, *warnings]))
+    if parts.error > GOOD_ERROR:
+        warnings.append(off)
+    return warnings
 
 
 def _uncovered(vertices: np.ndarray, hulls: Sequence[Hull]) -> list[str]:
@@ -202,7 +203,7 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         family="imported",
         split=job.split,
         scale=scale,
-        volume_error=parts.error + cavity_share(mesh, body),
+        volume_error=parts.error + (body.volume / body.solid.volume - 1.0),  # parts are full
         volume_method=(
             f"{parts.method}; volume in which parts and solid differ; solid: {body.method}"
         ),
@@ -215,9 +216,10 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
 
 def _simplified(mesh: Any) -> tuple[Any, list[str]]:
     """A mesh of at most MAX_FACES faces, and what has to be said of it."""
-    coarse = cluster_vertices(mesh, MAX_FACES, closed=True)
-    if len(coarse.faces) == len(mesh.faces):
+    if len(mesh.faces) <= MAX_FACES:
         return mesh, []
+    mesh.merge_vertices()
+    coarse = cluster_vertices(mesh, MAX_FACES, closed=True)
     some = random_surface_points(mesh, COMPARED, np.random.default_rng(0))
     off = distances(coarse, some).max() / mesh.extents.max()
     note = (
@@ -270,11 +272,16 @@ def import_meshes(
         if progress:
             progress(result, len(results), len(plan))
 
-    known = {job.name: _without_work(job, settings) for job in plan}
-    todo = [job for job in plan if known[job.name] is None]
+    todo = []
+    done = []
+    for job in plan:
+        if result := _without_work(job, settings):
+            done.append(result)
+        else:
+            todo.append(job)
     new = not out.exists()
     make_folder(out)
-    for result in filter(None, known.values()):
+    for result in done:
         finish(result)
     workers = max(min(jobs or os.cpu_count() or 1, len(todo)), 1)
     run_tasks(

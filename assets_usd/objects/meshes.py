@@ -98,8 +98,8 @@ def scales_that_fit(
     """
     low, high = fit.longest
     longest = float(max(sides))
-    shortest = float(min(sides))
-    return max(low / longest, fit.thinnest / shortest), min(high / longest, fit.mean_width / width)
+    least = max(low / longest, fit.thinnest / float(min(sides)))
+    return least, min(high / longest, fit.mean_width / width)
 
 
 def scale_of(
@@ -117,14 +117,16 @@ def scale_of(
         factor, note = choose_scale(sides, width, unit, fit)
         return factor, [note] if note else [], []
     size = f"{sides.max() * unit:.3f} m"
-    (least, most) = scales_that_fit(sides, width, fit)
+    notes = [f"taken as {unit_name(unit)}, real size kept: {size}"]
+    least, most = scales_that_fit(sides, width, fit)
+    if least <= unit <= most:
+        return unit, notes, []
     misfit = (
         f"does not fit the hand at its real size of {size}, mean width {width * unit:.3f} m: "
         f"longest side {fit.longest[0]:g} to {fit.longest[1]:g} m, mean width at most "
         f"{fit.mean_width:.3g} m, shortest side at least {fit.thinnest:.3g} m"
     )
-    notes = [f"taken as {unit_name(unit)}, real size kept: {size}"]
-    return unit, notes, [] if least <= unit <= most else [misfit]
+    return unit, notes, [misfit]
 
 
 def mass_of(settings: ImportSettings, volume: float) -> tuple[float, list[str], list[str]]:
@@ -180,8 +182,9 @@ def choose_scale(
     def fitting(unit: float) -> float:
         return float(np.clip(unit, least, most))
 
-    units = [UNITS_M[name] for name in GUESSED_UNITS] if unit is None else [unit]
-    unit = min(units, key=lambda metres: abs(np.log(fitting(metres) / metres)))
+    if unit is None:
+        units = map(UNITS_M.__getitem__, GUESSED_UNITS)
+        unit = min(units, key=lambda metres: abs(np.log(fitting(metres) / metres)))
     factor = fitting(unit)
     words = [] if unit == 1.0 else [f"taken as {unit_name(unit)}"]
     if factor != unit:

@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from scipy.spatial.transform import Rotation
 
+from vd.assets_usd.hand_layer import author, new_layer, save_layer
 from vd.assets_usd.objects.contact_layer import (
     LAYER_FORMAT,
     Identified,
@@ -29,6 +31,12 @@ from vd.assets_usd.objects.contact_layer import (
     read_contact,
 )
 from vd.assets_usd.objects.geometry import Hull, Solid, Surface, principal_axes
+from vd.assets_usd.usd_prims import (
+    add_mesh,
+    define_body,
+    define_root,
+    numpy_quaternion,
+)
 from vd.command.files import atomic_path
 from vd.paper import PAPER
 
@@ -176,19 +184,6 @@ def build_model(
     )
 
 
-def add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Define a ``UsdGeom.Mesh`` of vertices [V, 3] and triangles [T, 3] in a stage."""
-    from pxr import UsdGeom, Vt
-
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreatePointsAttr(np.ascontiguousarray(vertices))
-    mesh.CreateFaceVertexIndicesAttr(np.ascontiguousarray(faces, dtype=np.int32).ravel())
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateExtentAttr(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
-    return mesh
-
-
 def write_object(path: Path, model: ObjectModel) -> Path:
     """Write a model to one USD file, atomically.
 
@@ -199,25 +194,10 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     Returns:
         The path.
     """
-    import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
-    from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
-
-    path = Path(path)
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
-    root = f"/{model.name}"
-    prim = UsdGeom.Xform.Define(stage, root).GetPrim()
-    stage.SetDefaultPrim(prim)
-    UsdPhysics.RigidBodyAPI.Apply(prim)
-    mass = UsdPhysics.MassAPI.Apply(prim)
-    mass.CreateMassAttr(model.mass_kg)
-    mass.CreateCenterOfMassAttr(Gf.Vec3f(*model.centre_of_mass))
-    mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, model.inertia)))
-    x, y, z, w = map(float, model.inertia_quat)
-    mass.CreatePrincipalAxesAttr(Gf.Quatf(w, x, y, z))
-
+    prim = define_root(stage, model.name)
+    define_body(prim, model.mass_kg, model.centre_of_mass, model.inertia, model.inertia_quat)
+    root = prim.GetPath()
     material = UsdShade.Material.Define(stage, f"{root}/material")
     physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     physics.CreateStaticFrictionAttr(PAPER.materials.friction)
@@ -254,14 +234,11 @@ def write_object(path: Path, model: ObjectModel) -> Path:
 
 def _key(name: str) -> str:
     """A field's name in camel case."""
-    first, *rest = name.split("_")
-    return first + "".join(word.title() for word in rest)
+    return name[0] + name.title().replace("_", "")[1:]
 
 
-def _layer(path: Path) -> Any:
+def _layer(path: Path) -> Sdf.Layer | None:
     """The layer of a USD file as it is now, with its sublayers in it; None if it is none."""
-    from pxr import Sdf, Tf, Usd
-
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
@@ -269,19 +246,21 @@ def _layer(path: Path) -> Any:
         return None
     if layer is None or not layer.subLayerPaths:
         return layer
-    below = [(path.parent / name, _layer(path.parent / name)) for name in layer.subLayerPaths]
-    for file, sublayer in below:
+    below = []  # which live as long as the stage is read
+    for file in map(path.parent.joinpath, layer.subLayerPaths):
+        sublayer = _layer(file)
         if sublayer is None:
             raise ObjectError(
                 f"{path}: its sublayer {file} is missing or no USD; put the object's file there"
             )
-    layer.subLayerPaths = [sublayer.identifier for _, sublayer in below]
+        below.append(sublayer)
+    layer.subLayerPaths = [sublayer.identifier for sublayer in below]
     return Usd.Stage.Open(layer).Flatten()
 
 
-def _custom(layer: Any) -> dict[str, Any]:
+def _custom(layer: Sdf.Layer | None) -> dict[str, Any]:
     """Custom data of an object's root prim; empty if the layer is no object of ours."""
-    prim = layer.GetPrimAtPath(f"/{layer.defaultPrim}") if layer and layer.defaultPrim else None
+    prim = layer and layer.GetPrimAtPath(f"/{layer.defaultPrim}")
     return dict(prim.customData.get(_CUSTOM, {})) if prim else {}
 
 
@@ -307,9 +286,6 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
-    import newton_usd_schemas  # noqa: F401 - before the first stage, or it lacks mimic joints
-    from pxr import Usd, UsdPhysics
-
     path = Path(path)
     if not path.is_file():
         raise ObjectError(f"{path}: no such object file")
@@ -351,23 +327,21 @@ def read_object(path: Path) -> ObjectModel:
         raise ObjectError(f"{path}: collision has no hull; import the object again")
     visual = mesh("visual")
     mass = UsdPhysics.MassAPI(prim)
-    axes = mass.GetPrincipalAxesAttr().Get()
-    quat = np.array([*axes.GetImaginary(), axes.GetReal()], dtype=np.float64)
     return ObjectModel(
         name=prim.GetName(),
         vertices=visual.vertices,
         faces=visual.faces,
         hulls=tuple(hulls),
         mass_kg=float(mass.GetMassAttr().Get()),
-        centre_of_mass=tuple(map(float, mass.GetCenterOfMassAttr().Get() or (0.0, 0.0, 0.0))),
+        centre_of_mass=tuple(mass.GetCenterOfMassAttr().Get()),
         contact=contact,
         inertia=np.array(mass.GetDiagonalInertiaAttr().Get(), dtype=np.float64),
-        inertia_quat=quat / np.linalg.norm(quat),
+        inertia_quat=numpy_quaternion(mass.GetPrincipalAxesAttr().Get()),
         surface_points=array("surface_points", "points"),
         symmetry=np.array(data["symmetry"], dtype=np.float64).reshape(-1, 4),
-        **{name: kind(data.get(_key(name), "")) for name, kind in _STORED.items()},
-        notes=tuple(str(data["notes"]).splitlines()),
-        warnings=tuple(str(data.get("warnings", "")).splitlines()),
+        **{name: kind(data[_key(name)]) for name, kind in _STORED.items()},
+        notes=tuple(data["notes"].splitlines()),
+        warnings=tuple(data["warnings"].splitlines()),
     )
 
 
@@ -385,10 +359,6 @@ def write_contact_layer(
     Raises:
         ObjectError: The file is no object.
     """
-    from pxr import Gf, Sdf
-
-    from vd.assets_usd.hand_layer import author, new_layer, save_layer
-
     item = read_object(item_file)
     layer = new_layer(
         item.name,
@@ -413,5 +383,4 @@ def write_contact_layer(
 
 def object_files(folder: Path) -> list[Path]:
     """The object files of a set's folder, sorted by name."""
-    files = sorted(Path(folder).glob("[!.]*"))
-    return [file for file in files if file.suffix in SUFFIXES]
+    return sorted(file for file in folder.glob("[!.]*.usd*") if file.suffix in SUFFIXES)

@@ -28,9 +28,6 @@ each object and call the files alike (``003_cracker_box/google_16k/textured.obj`
 ``Mug/meshes/model.obj``).
 """
 
-CLASHES_SHOWN = 3
-"""Files with one name that an error shows."""
-
 
 @dataclass(frozen=True)
 class Job:
@@ -59,18 +56,16 @@ def prim_name(stem: str) -> str:
     Latin letters lose their accents; others become their code points, so that names stay apart.
     """
     bare = re.sub("[\u0300-\u036f]", "", unicodedata.normalize("NFD", stem))
-    spelled = [
-        f"u{ord(letter):04x}" if letter.isalnum() and not letter.isascii() else letter
-        for letter in unicodedata.normalize("NFC", bare)
-    ]
-    name = re.sub(r"[^0-9A-Za-z_]+", "_", "".join(spelled)).strip("_") or "object"
-    return name if not name[0].isdigit() else f"o_{name}"
+    letters = unicodedata.normalize("NFC", bare)
+    spelled = re.sub(r"[^\W\x00-\x7f]", lambda found: f"u{ord(found[0]):04x}", letters)
+    name = re.sub(r"\W+", "_", spelled, flags=re.ASCII).strip("_") or "object"
+    return f"o_{name}" if name[0].isdigit() else name
 
 
 def says_nothing(word: str) -> bool:
     """Whether a file's or folder's name is of ``GENERIC_WORDS`` and resolutions (16k) alone."""
-    words = [part for part in re.split(r"[\W_]+", word.lower()) if part]
-    return all(part in GENERIC_WORDS or re.fullmatch(r"\d+k", part) for part in words)
+    words = set(re.findall(r"[^\W_]+", re.sub(r"\b\d+k\b", "", word.lower().replace("_", " "))))
+    return words <= GENERIC_WORDS
 
 
 def absolute(path: Path) -> Path:
@@ -89,11 +84,13 @@ def object_name(path: Path) -> str:
     It depends on the file's path alone, so that it stays the same whatever else is imported.
     """
     path = absolute(path)
-    names = [path.stem, *(folder.name for folder in path.parents if folder.name)]
-    return prim_name(next((name for name in names if not says_nothing(name)), path.stem))
+    place = path.with_suffix("")
+    while place.name and says_nothing(place.name):
+        place = place.parent
+    return prim_name(place.name or path.stem)
 
 
-def find_meshes(paths: Iterable[Path]) -> list[Path]:
+def find_meshes(paths: Sequence[Path]) -> list[Path]:
     """Mesh files among files and folders, each once, in a fixed order, absolute.
 
     A file that was named is kept whatever it is, so that it is refused by name. In a folder files
@@ -103,7 +100,6 @@ def find_meshes(paths: Iterable[Path]) -> list[Path]:
     Raises:
         MeshError: A path does not exist, or nothing was found.
     """
-    paths = list(paths)
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -124,7 +120,7 @@ def _meshes_below(folder: Path) -> list[Path]:
     files = []
     left_out: set[Path] = set()
     for path in sorted(folder.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        hidden = "/." in f"/{path.relative_to(folder)}"
         suffix = path.suffix.lower()
         if hidden or suffix not in MESH_SUFFIXES or not path.is_file():
             continue
@@ -151,8 +147,7 @@ def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
     for table in (folder / "objects.csv", folder.parent / "objects.csv"):
         if table.is_file():
             with table.open(newline="") as stream:
-                rows = list(csv.DictReader(stream))
-            return {row["name"]: row for row in rows if row.get("name")}
+                return {row.get("name", ""): row for row in csv.DictReader(stream)}
     return {}
 
 
@@ -162,41 +157,27 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
     Raises:
         MeshError: Two meshes would have one name; the message has both, and the remedy.
     """
-    taken: dict[str, Path] = {}
-    clashes: list[str] = []
+    jobs: dict[str, Job] = {}
     for mesh in meshes:
-        other = taken.setdefault(object_name(mesh), mesh)
-        if other != mesh:
-            clashes.append(f"  {object_name(mesh)}: {other} and {mesh}")
-    if clashes:
-        more = (
-            f"\n  and {len(clashes) - CLASHES_SHOWN} more" if len(clashes) > CLASHES_SHOWN else ""
-        )
-        raise MeshError(
-            "two meshes would have one name in the set:\n"
-            + "\n".join(clashes[:CLASHES_SHOWN])
-            + f"{more}\nName only the files that you want (such as FOLDER/*/textured.obj), "
-            "rename one, or import one into another set (--out)"
-        )
-    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
-    jobs = []
-    for name, mesh in taken.items():
-        if mesh.parent not in sidecars:
-            sidecars[mesh.parent] = read_sidecar(mesh.parent)
-        row = sidecars[mesh.parent].get(mesh.stem, {})
+        name = object_name(mesh)
+        if name in jobs:
+            raise MeshError(
+                f"two meshes would have one name in the set, {name}: {jobs[name].source} and "
+                f"{mesh}; name only the files that you want (such as FOLDER/*/textured.obj), "
+                "rename one, or import one into another set (--out)"
+            )
+        row = read_sidecar(mesh.parent).get(mesh.stem, {})
         source = row.get("source") or ""
         bracket = re.search(r"\(([^)]*)\)", source)
-        jobs.append(
-            Job(
-                str(mesh),
-                name,
-                str(out / f"{name}.usd"),
-                licence=row.get("licence") or (bracket.group(1) if bracket else licence),
-                provenance=f"{source}: {mesh.name}" if source else mesh.name,
-                split=row.get("split") or "",
-            )
+        jobs[name] = Job(
+            str(mesh),
+            name,
+            str(out / f"{name}.usd"),
+            licence=row.get("licence") or (bracket[1] if bracket else licence),
+            provenance=f"{source}: {mesh.name}" if source else mesh.name,
+            split=row.get("split") or "",
         )
-    return jobs
+    return list(jobs.values())
 
 
 def check_target(job: Job) -> None:
@@ -233,14 +214,17 @@ def default_set(paths: Sequence[Path]) -> Path:
         MeshError: The set holds objects from elsewhere.
         ObjectError: The name is that of a built-in set.
     """
-    above = Path(os.path.commonpath(list(map(absolute, paths))))
-    plain = re.sub(r"[^\w.-]+", "_", above.name).strip(".") or "objects"
-    name = object_name(above) if above.is_file() else plain
+    above = Path(os.path.commonpath([absolute(path) for path in paths]))
+    name = re.sub(r"[^\w.-]+", "_", above.name).strip(".") or "objects"
+    if above.is_file():
+        name = object_name(above)
     folder = objects_dir() / name
-    other = f"say where with --out, such as --out {objects_dir() / f'my-{name}'}"
     check_set_folder(folder)
-    for path in object_files(folder) if folder.is_dir() else ():
+    for path in object_files(folder):
         file = stored_facts(path).get("file")
         if file and not Path(file).is_relative_to(above):
-            raise MeshError(f"the set {folder} holds objects from elsewhere ({file}); {other}")
+            raise MeshError(
+                f"the set {folder} holds objects from elsewhere ({file}); say where with --out, "
+                f"such as --out {objects_dir() / f'my-{name}'}"
+            )
     return folder

@@ -16,7 +16,6 @@ from vd.assets_usd.objects.geometry import (
     convex_hull,
     hull_volume,
     inside,
-    mesh_volume,
     sides_along_axes,
     triangle_areas,
 )
@@ -120,8 +119,8 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
             f"degenerate: all {before} faces have no area; a GLB is to be exported without "
             f"compression"
         )
-    if len(mesh.faces) < before:
-        notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
+    if dropped := before - len(mesh.faces):
+        notes.append(f"removed {dropped} degenerate or duplicate faces")
     mesh = _largest_body(_without_strays(_opened_seams(mesh), notes, warnings), warnings)
     sides = sides_along_axes(mesh.vertices)
     if sides.min() < SLIVER_THICKNESS * sides.max():
@@ -154,23 +153,15 @@ def _opened_seams(mesh: Any) -> Any:
     Surfaces that only touch along an edge are closed, yet no manifold; apart from each other they
     are.
     """
-    count = np.bincount(mesh.edges_unique_inverse)
-    if count.max() <= 2:
+    if np.bincount(mesh.edges_unique_inverse).max() <= 2:
         return mesh
-    # Corners of faces that meet in a plain edge share a vertex, others do not.
+    # Corners of faces that meet in an edge of two faces share a vertex, others do not.
     faces = mesh.faces
-    edges = mesh.edges_unique_inverse.reshape(-1, 3)  # (a, b), (b, c), (c, a) of every face
-    order = np.argsort(edges.ravel(), kind="stable")
-    plain = order[count[edges.ravel()[order]] == 2].reshape(-1, 2)
-    face, start = np.divmod(plain, 3)
     links = []
-    for first in (start, (start + 1) % 3):  # the edge's ends on one face, and the same on the other
-        vertex = faces[face[:, 0], first[:, 0]]
-        other = np.argmax(faces[face[:, 1]] == vertex[:, None], axis=1)
-        links.append(np.stack([3 * face[:, 0] + first[:, 0], 3 * face[:, 1] + other]))
-    corner = trimesh.graph.connected_component_labels(
-        np.concatenate(links, axis=1).T, node_count=faces.size
-    )
+    for vertex in mesh.face_adjacency_edges.T:
+        place = np.argmax(faces[mesh.face_adjacency] == vertex[:, None, None], axis=2)
+        links.append(3 * mesh.face_adjacency + place)
+    corner = trimesh.graph.connected_component_labels(np.concatenate(links), node_count=faces.size)
     vertices = np.zeros((corner.max() + 1, 3))
     vertices[corner] = mesh.vertices[faces.ravel()]
     return trimesh.Trimesh(vertices, corner.reshape(-1, 3), process=False)
@@ -383,11 +374,7 @@ def _convex_hulls(pieces: list[Any], outer: np.ndarray) -> tuple[Hull, ...]:
     hulls = []
     for number in np.flatnonzero(outer):
         piece = pieces[number]
-        try:
-            hull = convex_hull(piece.vertices)
-        except ValueError:
+        if not piece.is_watertight or abs(piece.volume) <= CONVEX * hull_volume(piece.vertices):
             return ()
-        if not piece.is_watertight or abs(piece.volume) < CONVEX * mesh_volume(*hull):
-            return ()
-        hulls.append(hull)
+        hulls.append(convex_hull(piece.vertices))
     return tuple(hulls)

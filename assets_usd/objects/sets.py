@@ -90,7 +90,7 @@ def check_sets(names_or_paths: Iterable[str | Path]) -> None:
 
 
 def _holds_objects(place: Path) -> bool:
-    return place.is_file() or (place.is_dir() and bool(object_files(place)))
+    return place.is_file() or bool(object_files(place))
 
 
 def _place(entry: str | Path) -> Path:
@@ -108,22 +108,24 @@ def _place(entry: str | Path) -> Path:
         return built_in_folder(entry)
     named = root / path.name if path.name == str(entry) else root
     # A folder of meshes does not hide the set that was imported from it.
-    places = [place for place in (path, named) if _holds_objects(place)]
-    if len(places) == 2 and not path.samefile(named):
-        raise ObjectError(
-            f"{str(entry)!r} is both a folder here and a set; write ./{entry}, or {named}"
-        )
-    if places:
-        return places[0]
+    there = _holds_objects(named)
+    if _holds_objects(path):
+        if there and not path.samefile(named):
+            raise ObjectError(
+                f"{str(entry)!r} is both a folder here and a set; write ./{entry}, or {named}"
+            )
+        return path
+    if there:
+        return named
     if path.is_dir():
         raise ObjectError(
             f"{path}: no object file (*.usd); make some of its meshes: vd-assets import {path}"
         )
-    there = sorted(each.name for each in root.glob("*/") if _holds_objects(each))
+    imported = sorted({file.parent.name for file in root.glob("*/[!.]*.usd*")})
     raise ObjectError(
         f"no object set or path {str(entry)!r}.\n"
         f"  built in, for --objects: {', '.join(BUILT_IN)}\n"
-        f"  in {root}: {', '.join(there) or 'none'}\n"
+        f"  in {root}: {', '.join(imported) or 'none'}\n"
         f"  import meshes as a set: vd-assets import MESHES --out {named}\n"
         "  of our own: procedural-150-seed0, procedural-heldout-30-seed0 and other numbers"
     )
@@ -153,7 +155,7 @@ def set_files(names_or_paths: Iterable[str | Path]) -> list[Path]:
         place = _place(entry)
         if not _holds_objects(place):
             _author(place)
-        files += [place] if place.is_file() else object_files(place)
+        files += object_files(place) or [place]
     if not files:
         raise ObjectError(
             "no object set was named; for example: cube, procedural-150-seed0, or a folder"

@@ -36,14 +36,10 @@ LINE = 1.25
 """Width of a usual letter and height of a line, as shares of the font's size."""
 
 
-def _draw(
-    axes: Any, parts: Sequence[tuple[np.ndarray, np.ndarray]], colours: Sequence[Any]
-) -> None:
-    """Draw meshes so that they fill the axes."""
-    corners = np.concatenate([vertices[faces] for vertices, faces in parts])
-    colour = np.repeat(np.array(colours), [len(faces) for _, faces in parts], axis=0)
+def _draw(axes: Any, corners: np.ndarray, colours: Any) -> None:
+    """Draw triangles [T, 3, 3] so that they fill the axes."""
     surface = Poly3DCollection(
-        corners, facecolors=colour, edgecolors=colour, linewidths=0.3, shade=True
+        corners, facecolors=colours, edgecolors=colours, linewidths=0.3, shade=True
     )
     axes.add_collection3d(surface)
     middle = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
@@ -74,15 +70,15 @@ def _height_in(lines: int, points: float) -> float:
     return lines * LINE * points / 72.0 + MARGIN_IN
 
 
-def _caption(model: ObjectModel) -> str:
-    """What is written below an object: name, size, parts, error, warnings."""
+def _caption(model: ObjectModel) -> list[str]:
+    """Lines below an object: name, size, parts, error, warnings."""
     facts = (
         f"{model.longest_side * 1e3:.0f} mm, parts: {len(model.hulls)}, ±{model.volume_error:.1%}"
     )
     lines: list[str] = []
     for text in (model.name, facts, *model.warnings):
         lines += _lines(text, CAPTION_POINTS, 2 * TILE_IN)
-    return "\n".join(lines)
+    return lines
 
 
 def save_figure(figure: Any, path: Path) -> Path:
@@ -114,8 +110,7 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     head = _lines(f"{title}, objects: {len(models)}", TITLE_POINTS, width)
     head += _lines(summary, TITLE_POINTS, width)
     captions = list(map(_caption, models))
-    most_lines = max(caption.count("\n") + 1 for caption in captions)
-    caption_in = _height_in(most_lines, CAPTION_POINTS)
+    caption_in = _height_in(max(map(len, captions)), CAPTION_POINTS)
     head_in = _height_in(len(head), TITLE_POINTS) + MARGIN_IN
     height = rows * (TILE_IN + caption_in) + head_in
     figure = Figure((width, height), dpi=100)
@@ -126,13 +121,18 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
         left = 2 * column * side
         bottom = 1.0 - (head_in + row * (TILE_IN + caption_in)) / height - tall
         drawing = figure.add_axes((left, bottom, side, tall), projection="3d")
-        _draw(drawing, [(model.vertices, model.faces)], [MESH_COLOUR])
-        hues = [part_colour(number, 0.52, 0.97) for number in range(len(model.hulls))]
+        _draw(drawing, model.vertices[model.faces], [MESH_COLOUR])
+        corners: list[np.ndarray] = []
+        hues: list[Any] = []
+        for number, hull in enumerate(model.hulls):
+            corners.extend(hull.vertices[hull.faces])
+            hues += [part_colour(number, 0.52, 0.97)] * len(hull.faces)
         drawing = figure.add_axes((left + side, bottom, side, tall), projection="3d")
-        _draw(drawing, model.hulls, hues)
+        _draw(drawing, np.stack(corners), hues)
         colour = WARNING_COLOUR if model.warnings else "black"
         left += MARGIN_IN / width
-        figure.text(left, bottom, captions[i], fontsize=CAPTION_POINTS, va="top", color=colour)
+        caption = "\n".join(captions[i])
+        figure.text(left, bottom, caption, fontsize=CAPTION_POINTS, va="top", color=colour)
     corner = (MARGIN_IN / width, 1.0 - MARGIN_IN / height)
     figure.text(*corner, "\n".join(head), fontsize=TITLE_POINTS, va="top")
     return save_figure(figure, path)

@@ -75,15 +75,13 @@ def read_usd(path: Path) -> Surface:
         MeshError: No USD, nothing to read in it, or geometry of a kind that is not read.
     """
     stage = opened(path)
-    prims = _shown(stage)
-    for prim in prims:
-        kind = str(prim.GetTypeName())
-        if kind in _UNREAD:
-            raise MeshError(f"{prim.GetPath()} is a {kind}, which is not read; make it a mesh")
     cache = UsdGeom.XformCache()
     parts = []
-    for prim in prims:
-        if prim.IsA(UsdGeom.Mesh):
+    for prim in _shown(stage):
+        kind = prim.GetTypeName()
+        if kind in _UNREAD:
+            raise MeshError(f"{prim.GetPath()} is a {kind}, which is not read; make it a mesh")
+        if kind == "Mesh":
             matrix = np.array(cache.GetLocalToWorldTransform(prim))
             parts.append(mesh_triangles(prim, matrix))
     if not parts:
@@ -123,17 +121,16 @@ def mesh_triangles(prim: Any, matrix: np.ndarray) -> Surface:
     mesh = UsdGeom.Mesh(prim)
     first = Usd.TimeCode.EarliestTime()
     points = mesh.GetPointsAttr().Get(first) or ()
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(first) or (), dtype=np.int32)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(first) or (), dtype=np.int32)
-    sound, why = UsdGeom.Mesh.ValidateTopology(
-        Vt.IntArray.FromNumpy(corners), Vt.IntArray.FromNumpy(counts), len(points)
-    )
+    corners = mesh.GetFaceVertexIndicesAttr().Get(first) or Vt.IntArray()
+    counts = mesh.GetFaceVertexCountsAttr().Get(first) or Vt.IntArray()
+    sound, why = UsdGeom.Mesh.ValidateTopology(corners, counts, len(points))
     if not sound or not len(counts):
         raise MeshError(f"{prim.GetPath()} is no valid mesh: {why or 'no faces'}; export it again")
-    triangles = np.maximum(counts - 2, 0)
+    triangles = np.maximum(np.array(counts) - 2, 0)
     first_corner = np.repeat(np.cumsum(counts) - counts, triangles)
     step = 1 + np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    faces = corners[np.stack([first_corner, first_corner + step, first_corner + step + 1], axis=1)]
+    fans = np.stack([first_corner, first_corner + step, first_corner + step + 1], axis=1)
+    faces = np.array(corners)[fans]
     linear = matrix[:3, :3]
     mirrored = np.linalg.det(linear) < 0.0
     if mirrored != (mesh.GetOrientationAttr().Get(first) == UsdGeom.Tokens.leftHanded):

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import canonical_quat
 from vd.assets_usd.objects.geometry import (
     Surface,
     convex_hull,
@@ -160,8 +159,8 @@ def _goal(text: str) -> np.ndarray:
             f"--goal {text}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90"
         )
     if wanted == 4:
-        return canonical_quat(numbers / length)
-    return canonical_quat(Rotation.from_rotvec(angle * numbers / length).as_quat())
+        return np.asarray(Rotation.from_quat(numbers).as_quat(canonical=True))
+    return np.asarray(Rotation.from_rotvec(angle * numbers / length).as_quat(canonical=True))
 
 
 def _surface(path: Path, generator: np.random.Generator) -> Surface:
