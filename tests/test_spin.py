@@ -22,7 +22,7 @@ from vd.evaluate.spin import SPIN_FILE, turn
 from vd.logs.hand_log import read_log
 from vd.policy.agents import open_policy, task_for
 from vd.train import cli as train
-from vd.train.presets import PRESETS, smoke
+from vd.train.presets import PRESETS, cpu_demo, smoke
 from vd.train.teacher import build_teacher
 
 STEPS = 4
@@ -33,7 +33,7 @@ STEPS = 4
 def policy(tmp_path_factory) -> str:
     """One iteration of learning to spin, with a hand that is always there."""
     out = tmp_path_factory.mktemp("spin")
-    cfg = smoke()
+    cfg = smoke(cpu_demo())
     task = replace(
         cfg.env,
         num_envs=4,

@@ -14,7 +14,7 @@ from vd.command.device import resolve_device
 from vd.command.files import write_json
 from vd.command.line import PRINT, ConfigFile, parse, take_config
 from vd.policy.agents import DEFAULT_POLICY, check_names, installed_policies
-from vd.train.begin import settings_of
+from vd.train.begin import find_start, read_start, settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
@@ -83,18 +83,19 @@ def parse_teacher(
             ``--init`` is no teacher.
     """
     arguments, file = starting(normalise(arguments, SHORT_FORMS))
-    preset, init, resume = (
-        value_of(arguments, flag) for flag in ("--preset", "--init", "--resume")
-    )
+    preset = value_of(arguments, "--preset")
+    init = value_of(arguments, "--init")
+    resume = value_of(arguments, "--resume")
     out = value_of(arguments, "--out")
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
+    small = "--smoke" in arguments
     if preset is not None and preset not in PRESETS:
         raise ValueError(f"--preset {preset} is none; one of {', '.join(PRESETS)}")
     chosen = False
-    if "--smoke" in arguments:
-        start = smoke(PRESETS[preset or "cpu-demo"]())
-    elif preset is None and init is not None:
-        start = settings_of(init, PRESETS["gpu"]())
+    if preset is None and init is not None:
+        start = settings_of(init)
+    elif small:
+        start = PRESETS[preset or "cpu-demo"]()
     elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
         _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](), file)
@@ -103,6 +104,9 @@ def parse_teacher(
         start = PRESETS[preset]()
     else:
         start = PRESETS[preset or "gpu"]()
+    if small:
+        done = 0 if init is None else read_start(find_start(init))["env_steps"]
+        start = smoke(start, done)
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start

@@ -306,12 +306,11 @@ def for_hand(cfg: TeacherCfg, hand: str | None) -> TeacherCfg:
     return replace(cfg, env=replace(cfg.env, observation=replace(cfg.env.observation, view="goal")))
 
 
-def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
-    """A preset, cpu-demo by default, shrunk to run all parts in at most a minute.
+def smoke(cfg: TeacherCfg, steps_before: int = 0) -> TeacherCfg:
+    """Settings shrunk to run all parts in at most a minute.
 
-    It learns nothing.
+    They learn nothing. What they begin from was trained for ``steps_before``.
     """
-    cfg = cfg or cpu_demo()
     return replace(
         cfg,
         smoke=True,
@@ -319,7 +318,7 @@ def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
             cfg.run,
             out=SMOKE_RUN,
             device="cpu",
-            max_steps=2048,
+            max_steps=steps_before + 2048,
             max_minutes=1.0,
             save_every=1,
             logger="none",
