@@ -11,20 +11,25 @@ ANGLE_GRID = 4096
 
 
 def draw_starts_and_goals(
-    name: str, episodes: int, *, seed: int, max_goal_angle: float = np.pi
+    names: Sequence[str], episodes: int, *, seed: int, max_goal_angle: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the initial and goal orientations of one object.
+    """Draw the initial and goal orientations of objects.
 
-    They depend on the object's name, the seed and the number of the episode alone: not on the other
+    They depend on an object's name, the seed and the number of the episode alone: not on the other
     objects, the number of environments or the device. Starts are uniform on SO(3); goals are
     uniform on the part of SO(3) within ``max_goal_angle`` [rad], in (0, pi], of the start.
 
     Returns:
-        Starts and goals, quaternions xyzw, shapes [M, 4].
+        Starts and goals, quaternions xyzw, shapes [K, M, 4].
     """
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    start = Rotation.random(episodes, rng=rng).as_quat()
-    return start, draw_goals(start, rng, max_goal_angle)
+    starts = []
+    goals = []
+    for name in names:
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        start = Rotation.random(episodes, rng=rng).as_quat()
+        starts.append(start)
+        goals.append(draw_goals(start, rng, max_goal_angle))
+    return np.stack(starts), np.stack(goals)
 
 
 def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: float) -> np.ndarray:

@@ -6,7 +6,6 @@ What a folder holds already, measured with the same settings and the same policy
 import hashlib
 import json
 import math
-import re
 import shlex
 import sys
 import time
@@ -62,7 +61,6 @@ NOT_RUN = "not run; the same command goes on from here"
 _NOT_MEASURED = ("out", "device", "num_envs", "jobs", "shard")
 _PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine")
 """Flags beside ``--suite`` that every line gets."""
-_GROUP = re.compile(r"([\w-]+)=SET\b")
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def run_suite(cfg: EvalCfg) -> Result:
     assert cfg.suite is not None
     suite = read_suite(cfg.suite)
     wanted = groups_of(suite.lines)
-    groups = object_groups(cfg.objects, wanted, members=suite.members)
+    groups = object_groups(cfg.objects, wanted, suite.members)
     entries = [entry for entry in suite.lines if groups.keys() >= set(groups_of([entry]))]
     tasks = shard(make_tasks(cfg, entries, groups), cfg.shard)
     results: dict[tuple[str, str], Result] = {}
@@ -260,7 +258,10 @@ def groups_of(entries: Sequence[SuiteEntry]) -> list[str]:
     groups: list[str] = []
     for entry in entries:
         for line in entry.lines:
-            groups += _GROUP.findall(line)
+            for item in _parsed(line).objects:
+                group, _, name = item.partition("=")
+                if name == "SET":
+                    groups.append(group)
     return list(dict.fromkeys(groups))
 
 
@@ -293,10 +294,7 @@ def shown(entry: SuiteEntry) -> str:
 
 
 def object_groups(
-    objects: Sequence[str],
-    wanted: Sequence[str],
-    *,
-    members: Mapping[str, Sequence[str]] | None = None,
+    objects: Sequence[str], wanted: Sequence[str], members: Mapping[str, Sequence[str]]
 ) -> dict[str, ObjectGroup]:
     """The objects of each wanted group.
 
@@ -321,8 +319,8 @@ def object_groups(
             print(f"left out: {group}; give --objects {group}=SET", file=sys.stderr)
             continue
         files = set_files(sets)
-        if names := (members or {}).get(group):
-            files = _members(group, files, names)
+        if group in members:
+            files = _members(group, files, members[group])
             sets = tuple(map(str, files))
         text = f"{len(files)} of {shown_name(', '.join(given.get(group, sets)))}"
         if group not in given and group != "symmetric":

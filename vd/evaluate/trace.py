@@ -222,12 +222,10 @@ def record(
         held={way: np.full(shape, np.nan) for way in ways if schedule.hold_s},
     )
     for numbers, state in drawn_rounds(env, episodes, starts, goals):
-        if schedule.table_s is not None:
-            env.sim.place_table(present=True)
         env.load_state_dict(state)
         _Round(env, trace, numbers, goal_steps).run(policy, ways, tolerance, turns, on_step)
-    if schedule.table_s is not None:
-        env.sim.place_table(present=True)
+        if schedule.table_s is not None:
+            env.sim.place_table(present=True)
     return trace
 
 
@@ -313,9 +311,9 @@ class _Round:
         self._exact = np.zeros(env.num_envs)
         # The state in which each way to stop ends an environment, after how many steps; -1: not
         # yet.
-        self._stopped = {
-            way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held
-        }
+        self._stopped: dict[Way, tuple[np.ndarray, dict[str, torch.Tensor]]] = {}
+        for way in trace.held:
+            self._stopped[way] = (np.full(env.num_envs, -1), motion_of(env, copy=True))
 
     def run(
         self,
@@ -391,8 +389,6 @@ class _Round:
     ) -> None:
         """Write what led to the state after ``step`` steps, and what a policy predicts there."""
         envs = self._at_first(envs)
-        if not len(envs):
-            return
         place = (*self._place(envs), step)
         self._trace.action_norm[place] = norm[envs]
         if predicted is not None:
@@ -404,8 +400,6 @@ class _Round:
         trace = self._trace
         self._exact[envs] = rotation_distance(quat[envs], self._goal[envs])
         envs = self._at_first(envs)
-        if not len(envs):
-            return
         objects, numbers = self._place(envs)
         trace.exact[objects, numbers, step] = self._exact[envs]
         for k in np.unique(objects):
@@ -420,8 +414,7 @@ class _Round:
         trace = self._trace
         self._write_errors(envs, step, quat)
         first = self._at_first(envs)
-        if len(first):
-            trace.still[(*self._place(first), step)] = env.still.numpy()[first] != 0
+        trace.still[(*self._place(first), step)] = env.still.numpy()[first] != 0
         trace.failed[self._place(envs)] = env.sim.failed.numpy()[envs] != 0
         done = envs[env.done.numpy()[envs] != 0]
         trace.fell[self._place(done)] = env.fell.numpy()[done] != 0
@@ -454,8 +447,7 @@ class _Round:
             chosen = stops[way]
             chosen = chosen[after[chosen] < 0]
             after[chosen] = step
-            if len(chosen):
-                copy_motion(state, motion_of(self._env), chosen)
+            copy_motion(state, motion_of(self._env), chosen)
 
     def _hold(self, way: Way) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""

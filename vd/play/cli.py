@@ -130,7 +130,7 @@ def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C."""
     from vd.play.viewer import PlayViewer
 
-    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False)
+    viewer = PlayViewer(session, host=cfg.host, port=cfg.port)
     print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
     try:
         viewer.run()

@@ -44,7 +44,6 @@ class PlayViewer:
         session: What is shown.
         host: Address.
         port: Port.
-        verbose: Whether Newton's viewer says that it begins.
     """
 
     def __init__(
@@ -53,9 +52,8 @@ class PlayViewer:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        verbose: bool = True,
     ):
-        self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
+        self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=False)
         options = self.viewer._viewer_option_handles
         for name in options.keys() - set(SHOWN_OPTIONS):
             options.pop(name).remove()
