@@ -62,7 +62,10 @@ class TeacherRunner(TrainingLoop):
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means = StepMeans()
-        self.window = self._new_window()
+        # Two episodes, so that a window never misses the time-outs of environments that run in
+        # step.
+        length = math.ceil(2 * env.max_episode_length / ppo.rollout_steps)
+        self.window = GoalWindow(length, success_ends=bool(task.get("success_ends_episode")))
         """The newest goals, by which the best is chosen."""
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
@@ -206,12 +209,6 @@ class TeacherRunner(TrainingLoop):
             losses, self._networks, f"{LOWER_RATES}, or raise the lower end of --policy.std-range"
         )
         return losses
-
-    def _new_window(self) -> GoalWindow:
-        # Two episodes, so that a window never misses the time-outs of environments that run in
-        # step.
-        length = math.ceil(2 * self.env.max_episode_length / self.ppo.rollout_steps)
-        return GoalWindow(length, success_ends=bool(self.task.get("success_ends_episode", False)))
 
     def _spec(self) -> PolicySpec:
         """Shape of the actor."""

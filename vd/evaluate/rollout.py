@@ -69,14 +69,21 @@ def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> lis
             f"no environment simulates object {envs_of.argmin()}; raise the number of environments "
             f"to {objects}"
         )
-    place = np.zeros_like(world_object)  # of each environment among those of its object
-    for k in range(objects):
-        place[world_object == k] = np.arange(envs_of[k])
+    place = place_of(world_object)
     rounds = []
     for turn in range(int(np.ceil(episodes / envs_of.min()))):
         number = turn * envs_of[world_object] + place
         rounds.append(np.where(number < episodes, number, -1))
     return rounds
+
+
+def place_of(world_object: np.ndarray) -> np.ndarray:
+    """Place of each environment among those of its object, from 0, shape [N]."""
+    place = np.zeros_like(world_object)
+    for k in np.unique(world_object):
+        same = world_object == k
+        place[same] = np.arange(same.sum())
+    return place
 
 
 def unit_quats(quat: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from vd.command.files import make_folder, write_json
 from vd.command.line import parse
 from vd.command.versions import code_fingerprint
 from vd.command.workers import run_tasks, shard
-from vd.evaluate.cfg import EvalCfg, parse_groups
+from vd.evaluate.cfg import PASSED_ON, EvalCfg, parse_groups
 from vd.evaluate.claims import claimed
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
@@ -40,13 +40,7 @@ from vd.evaluate.page import (
 )
 from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
-from vd.evaluate.suite import (
-    OWN_SETS,
-    Claim,
-    Suite,
-    SuiteEntry,
-    read_suite,
-)
+from vd.evaluate.suite import OWN_SETS, Claim, Suite, SuiteEntry, read_suite
 from vd.paper import PAPER
 from vd.policy.agents import find_policy, has_no_file, open_policy, sees_clouds
 
@@ -59,8 +53,6 @@ ASPECTS = (1.0, 2.0, 4.0, math.inf)
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "num_envs", "jobs", "shard")
-_PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine")
-"""Flags beside ``--suite`` that every line gets."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +271,7 @@ def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, ObjectGroup
         else:
             objects.append(item)
     changes: dict[str, Any] = {}
-    for name in _PASSED_ON:
+    for name in PASSED_ON:
         value = getattr(cfg, name)
         if value != getattr(EvalCfg, name):
             changes[name] = value
