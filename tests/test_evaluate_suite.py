@@ -265,6 +265,7 @@ def test_our_objects_stand_for_the_papers_where_none_are_given():
     [
         (["--suite", "paper", "--condition", "mixed"], "--condition is decided by --suite paper"),
         (["--suite", "paper", "--in-air"], "--in-air is decided by --suite paper"),
+        (["--suite", "paper", "--plan"], "--plan is decided by --suite paper"),
         (
             ["dclaw4-cube", "--jobs", "2"],
             "--jobs and --shard are of a suite; add --suite paper",

@@ -55,8 +55,8 @@ class TeacherCfg:
     """Levels of the curriculum (goals, stillness, physics, air) at which a run with --init begins.
     None: those of what it begins from; 1 for a policy that does not say, the task as configured."""
     smoke: bool = False
-    """Check the installation: the preset, cpu-demo if none is named, tiny, on the CPU, for at most
-    a minute. It learns nothing, and keeps nothing unless --out is given."""
+    """Check the installation: the preset, or the training of what --init names, or cpu-demo, tiny, on
+    the CPU, for at most a minute. It learns nothing, and keeps nothing unless --out is given."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
     policy: PolicyCfg = field(default_factory=PolicyCfg)
