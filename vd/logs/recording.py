@@ -9,7 +9,7 @@ import contextlib
 import csv
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -117,14 +117,23 @@ def read_recording(path: str | Path) -> Recording:
     return recording
 
 
-def write_recording(recording: Recording, folder: str | Path) -> Path:
-    """Write a recording into a folder, which is returned.
+def write_recording(
+    recording: Recording, folder: str | Path, *, only: Collection[str] | None = None
+) -> Path:
+    """Write a recording into a folder: each file atomically, ``recording.json`` last.
 
-    Each file atomically, ``recording.json`` last.
+    Args:
+        recording: The recording.
+        folder: Where.
+        only: CSV files to write, where the others are there from before; all by default.
+
+    Returns:
+        The folder.
     """
     folder = Path(folder)
     for trajectory in recording.trajectories:
-        write_table(folder / trajectory.file, trajectory, recording.joints)
+        if only is None or trajectory.file in only:
+            write_table(folder / trajectory.file, trajectory, recording.joints)
     header = {
         "format": FORMAT,
         "model": recording.model,

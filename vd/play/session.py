@@ -87,4 +87,4 @@ class Session:
 
     def _look(self) -> None:
         """Show what no step has changed."""
-        self.snapshot: Snapshot = self._watcher.read(stepped=False)[0]
+        self.snapshot = self._watcher.read(stepped=False)[0]
