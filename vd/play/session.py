@@ -11,7 +11,7 @@ from vd.evaluate.rollout import draw_goals
 from vd.evaluate.statistics import symmetric_error
 from vd.evaluate.trace import advance
 from vd.play.camera_view import camera_view
-from vd.play.video import Snapshot, Watcher
+from vd.play.video import Watcher
 
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
