@@ -152,15 +152,14 @@ def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
     Raises:
         ValueError: Names the flag, what the run began with, and the remedy.
     """
-    for name in ("preset", "init", "stage", "smoke"):
-        flag = f"--{name}"
+    asked = {name: value_of(arguments, f"--{name}") for name in ("preset", "init", "stage")}
+    asked["smoke"] = "True" if "--smoke" in arguments else None
+    for name, value in asked.items():
         begun = getattr(saved, name, None)
-        asked = value_of(arguments, flag) if name != "smoke" else None
-        differs = asked is not None and asked != str(begun)
-        if differs or (name == "smoke" and flag in arguments and not begun):
+        if value not in (None, str(begun)):
             raise ValueError(
-                f"{flag} {asked or ''}: the run in {saved.run.out} began with {begun}, and goes on "
-                f"so; leave {flag} out, or choose another --out"
+                f"--{name} {value}: the run in {saved.run.out} began with {begun}, and goes on so; "
+                f"leave --{name} out, or choose another --out"
             )
 
 
@@ -178,12 +177,10 @@ def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[
             group, _, field = short_forms[name[3:] if off else name].rpartition(".")
             name = f"{group}.{'no-' if off else ''}{field}"
         result += [f"--{name}", value] if equals else [f"--{name}"]
-    for index, argument in enumerate(result):
-        if argument == "--resume" and (
-            index + 1 == len(result) or result[index + 1].startswith("--")
-        ):
-            result[index + 1 : index + 1] = ["latest"]
-            break
+    if "--resume" in result:
+        after = result.index("--resume") + 1
+        if after == len(result) or result[after].startswith("--"):
+            result.insert(after, "latest")
     return result
 
 
