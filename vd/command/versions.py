@@ -65,8 +65,12 @@ def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
 
 def _statements(text: str) -> str:
     """A module without comments, docstrings, and how its lines are broken."""
-    module = ast.parse(text)
-    for node in ast.walk(module):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            node.value = ast.Constant(...)
-    return ast.unparse(module)
+    return ast.unparse(_WithoutDocstrings().visit(ast.parse(text)))
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    """Drops statements that are nothing but text."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:  # noqa: N802  # as ast calls it
+        """One statement."""
+        return None if isinstance(node.value, ast.Constant) else node

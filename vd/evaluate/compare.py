@@ -194,10 +194,8 @@ def actor_of(
     from vd.policy.stopping import StoppingRule
 
     if policy is None and name not in BUILT_IN:
-        function = named_function(name, "the policy")
-        return FunctionPolicy(function, env.num_actions), Agent(
-            name, "function", "state", StoppingRule
-        )
+        function = FunctionPolicy(named_function(name, "the policy"), env.num_actions)
+        return function, Agent(name, "function", "state", StoppingRule)
     if policy is None:
         actor = BuiltIn(name, env.num_actions, seed=seed, device=env.device)
         return actor, Agent(name, name, "nothing", StoppingRule)

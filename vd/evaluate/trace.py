@@ -447,7 +447,8 @@ class _Round:
             chosen = stops[way]
             chosen = chosen[after[chosen] < 0]
             after[chosen] = step
-            copy_motion(state, motion_of(self._env), chosen)
+            if len(chosen):
+                copy_motion(state, motion_of(self._env), chosen)
 
     def _hold(self, way: Way) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""
