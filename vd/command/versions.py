@@ -71,6 +71,6 @@ def _statements(text: str) -> str:
 class _WithoutDocstrings(ast.NodeTransformer):
     """Drops statements that are nothing but text."""
 
-    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:  # noqa: N802  # as ast calls it
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:  # as ast calls it
         """One statement."""
         return None if isinstance(node.value, ast.Constant) else node
