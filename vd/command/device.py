@@ -17,7 +17,7 @@ def warp_device(name: str | None) -> str:
     except (ValueError, RuntimeError) as error:
         here = ", ".join(map(str, wp.get_devices()))
         raise ValueError(
-            f"--device is {name!r}; it has to be auto, or of those here: {here}"
+            f"device is {name!r}; it has to be auto, or of those here: {here}"
         ) from error
 
 
@@ -31,11 +31,21 @@ def resolve_device(name: str) -> str:
     """
     import torch
 
+    _keep_to_warnings()
     if name == "auto":
         name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-    if name != "cpu":
-        return warp_device(name)
-    _keep_to_warnings()
+    if name == "cuda":
+        name = "cuda:0"
+    if name == "cpu":
+        return name
+    index = name.removeprefix("cuda:")
+    if not name.startswith("cuda:") or not index.isdigit():
+        raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
+    if int(index) >= torch.cuda.device_count():
+        raise ValueError(
+            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or "
+            f"cpu"
+        )
     return name
 
 
