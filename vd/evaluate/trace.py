@@ -389,6 +389,8 @@ class _Round:
     ) -> None:
         """Write what led to the state after ``step`` steps, and what a policy predicts there."""
         envs = self._at_first(envs)
+        if not len(envs):
+            return
         place = (*self._place(envs), step)
         self._trace.action_norm[place] = norm[envs]
         if predicted is not None:
@@ -400,6 +402,8 @@ class _Round:
         trace = self._trace
         self._exact[envs] = rotation_distance(quat[envs], self._goal[envs])
         envs = self._at_first(envs)
+        if not len(envs):
+            return
         objects, numbers = self._place(envs)
         trace.exact[objects, numbers, step] = self._exact[envs]
         for k in np.unique(objects):
@@ -414,7 +418,8 @@ class _Round:
         trace = self._trace
         self._write_errors(envs, step, quat)
         first = self._at_first(envs)
-        trace.still[(*self._place(first), step)] = env.still.numpy()[first] != 0
+        if len(first):
+            trace.still[(*self._place(first), step)] = env.still.numpy()[first] != 0
         trace.failed[self._place(envs)] = env.sim.failed.numpy()[envs] != 0
         done = envs[env.done.numpy()[envs] != 0]
         trace.fell[self._place(done)] = env.fell.numpy()[done] != 0
