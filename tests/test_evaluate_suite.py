@@ -251,13 +251,13 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
 
 def test_our_objects_stand_for_the_papers_where_none_are_given():
     wanted = ["training", "validation", "held-out", "symmetric"]
-    groups = suite_run.object_groups((), wanted)
+    groups = suite_run.object_groups((), wanted, {})
     assert groups.keys() == OWN_SETS.keys(), "nothing stands in for validation objects"
     assert groups["training"].sets == OWN_SETS["training"] and "our own" in groups["held-out"].text
     left_out = set(SHIPPED_POLICIES) - set(EvalCfg(suite="paper").agent_names)
     assert left_out == {"allegro-cube", "leap-cube", "leap-objects"}, "not imported"
     with pytest.raises(ValueError, match=r"'table' .*training, validation, held-out"):
-        suite_run.object_groups(("table=cube",), wanted)
+        suite_run.object_groups(("table=cube",), wanted, {})
 
 
 @pytest.mark.parametrize(
@@ -265,6 +265,7 @@ def test_our_objects_stand_for_the_papers_where_none_are_given():
     [
         (["--suite", "paper", "--condition", "mixed"], "--condition is decided by --suite paper"),
         (["--suite", "paper", "--in-air"], "--in-air is decided by --suite paper"),
+        (["--suite", "paper", "--plan"], "--plan is decided by --suite paper"),
         (
             ["dclaw4-cube", "--jobs", "2"],
             "--jobs and --shard are of a suite; add --suite paper",

@@ -66,7 +66,7 @@ class Sees(Turn):
 
 @pytest.fixture
 def player():
-    viewer = PlayViewer(session(), verbose=False)
+    viewer = PlayViewer(session())
     yield viewer
     viewer.close()
 
@@ -127,7 +127,7 @@ def test_controls_reach_the_simulation(player):
 
 
 def test_what_a_policys_camera_sees_is_shown():
-    player = PlayViewer(session(Sees(), "dclaw4"), verbose=False)
+    player = PlayViewer(session(Sees(), "dclaw4"))
     player.run(steps=1)
     assert "believed 0.25" in player.status.content and "ms" in player.status.content
     seen, camera = player.session.view(), player.session.hand.camera

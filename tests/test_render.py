@@ -49,7 +49,7 @@ def pose(position, quat=IDENTITY):
 
 @pytest.fixture(scope="module")
 def cube_renderer():
-    return Renderer(None, [box("cube", [0.04] * 3)], width=320, height=240, goal_size=80)
+    return Renderer(None, [box("cube", [0.04] * 3)], width=320, height=240)
 
 
 def middle(mask):
@@ -79,7 +79,7 @@ def test_goal_has_the_outline_of_the_object_in_the_same_orientation():
     plate = box("plate", [0.10, 0.05, 0.01])
     quat = Rotation.from_euler("xyz", [0.5, 0.9, 0.3]).as_quat()
     camera = PictureCamera()
-    renderer = Renderer(None, [plate], width=160, height=160, goal_size=160, camera=camera)
+    renderer = Renderer(None, [plate], width=160, height=160, camera=camera)
     (same,) = renderer.render(pose(camera.target, quat), np.array([quat]))
     (other,) = renderer.render(pose(camera.target, quat), np.array([IDENTITY]))
 
@@ -94,7 +94,7 @@ def test_goal_has_the_outline_of_the_object_in_the_same_orientation():
 
 def test_each_cell_shows_its_own_object_and_goal():
     objects = [box("small", [0.02] * 3), box("large", [0.08] * 3)]
-    renderer = Renderer(None, objects, width=160, height=120, goal_size=60)
+    renderer = Renderer(None, objects, width=160, height=120)
     q = np.concatenate([pose((0.0, 0.0, 0.1)), pose((0.06, 0.0, 0.1))])
     small, large = renderer.render(q, np.array([IDENTITY, IDENTITY]))
     assert 8 < orange(large.scene).sum() / orange(small.scene).sum() < 32
@@ -103,7 +103,7 @@ def test_each_cell_shows_its_own_object_and_goal():
 
 
 def test_a_table_that_is_taken_away_is_not_drawn():
-    renderer = Renderer(None, [box("cube", [0.05] * 3)] * 2, width=160, height=120, goal_size=60)
+    renderer = Renderer(None, [box("cube", [0.05] * 3)] * 2, width=160, height=120)
     q, goals = np.repeat(pose((0.0, 0.0, 0.1)), 2, axis=0), np.array([IDENTITY] * 2)
     there, gone = (one.scene for one in renderer.render(q, goals, np.array([True, False])))
     spot = project(renderer.camera, np.array([[0.1, 0.0, 0.0]]), 160, 120)[0].round().astype(int)

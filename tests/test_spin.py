@@ -22,7 +22,7 @@ from vd.evaluate.spin import SPIN_FILE, SpinResult, Turns, turn
 from vd.logs.hand_log import read_log
 from vd.policy.agents import open_policy, task_for
 from vd.train import cli as train
-from vd.train.presets import PRESETS, smoke
+from vd.train.presets import PRESETS, cpu_demo, smoke
 from vd.train.teacher import build_teacher
 
 STEPS = 4
@@ -33,7 +33,7 @@ STEPS = 4
 def policy(tmp_path_factory) -> str:
     """One iteration of learning to spin, with a hand that is always there."""
     out = tmp_path_factory.mktemp("spin")
-    cfg = smoke()
+    cfg = smoke(cpu_demo())
     task = replace(
         cfg.env,
         num_envs=4,
@@ -172,3 +172,9 @@ def test_the_cylinder_is_as_symmetric_as_it_says():
         moved = turned.apply(corners)
         nearest = np.linalg.norm(moved[:, None] - corners[None], axis=2).min(axis=1)
         assert nearest.max() < 1e-6
+
+
+def test_what_hardly_turned_has_turned_by_zero_without_a_sign():
+    row = Turns("p", "cube", 4, -0.001, 0.0, per_drop=-0.01, dropped=0.25, held_s=1.0)
+    text = SpinResult((row,), (0.0, 0.0, 1.0), 1.0, "off", 0).text()
+    assert "0.00 (sd 0.00)" in text and "-0.0" not in text

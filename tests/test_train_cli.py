@@ -10,6 +10,8 @@ import pytest
 from vd.assets_usd.hands import HANDS
 from vd.command.config import from_dict, to_dict
 from vd.command.device import resolve_device
+from vd.policy.agents import SHIPPED_POLICIES
+from vd.policy.contract import installed_contract
 from vd.train.cli import main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
@@ -71,6 +73,13 @@ def test_a_preset_for_a_hand_of_its_own_serves_the_other():
         assert parse_teacher([*start, "--hand", "dclaw4"]).env.observation.view == "goal"
         flags = [*start, "--hand", "dclaw4", "--env.observation.view", "world"]
         assert parse_teacher(flags).env.observation.view == "world"
+
+
+def test_a_smoke_test_goes_on_from_what_is_named_whatever_was_trained_before():
+    cfg = parse_teacher(["--smoke", "--init", "dclaw4"])
+    begun = installed_contract(SHIPPED_POLICIES["dclaw4"])
+    assert cfg.run.max_steps == begun.env_steps + 2048
+    assert cfg.policy.hidden == begun.network.hidden and cfg.env.num_envs == 16
 
 
 def test_help_lists_at_most_80_flags_and_help_all_the_others_too(capsys):

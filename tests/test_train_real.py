@@ -11,7 +11,7 @@ from vd.policy.bundle import read_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
 from vd.train.metrics import PROGRESS_FILE, read_progress
-from vd.train.presets import smoke
+from vd.train.presets import cpu_demo, smoke
 from vd.train.runner import TeacherRunner
 from vd.train.teacher import build_teacher
 
@@ -20,7 +20,7 @@ TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
 
 def _train(run_dir: Path, iterations: int, observation=None, **begin) -> TeacherRunner:
     """A few iterations of a few environments on the CPU, with randomisation and curriculum on."""
-    cfg = smoke()
+    cfg = smoke(cpu_demo())
     task = replace(
         cfg.env,
         num_envs=8,
@@ -58,7 +58,7 @@ def test_a_run_goes_on_bit_for_bit_and_another_tells_its_critic_more_from_there(
     assert rows[1][-1]["level/goals"] > 0.0
 
     blind = read_policy(checkpoint_path(tmp_path / "part", 4))
-    told = replace(smoke().env.observation, dynamics="critic")
+    told = replace(smoke(cpu_demo()).env.observation, dynamics="critic")
     telling = _train(
         tmp_path / "telling", 0, init=str(checkpoint_path(tmp_path / "part", 4)), observation=told
     )

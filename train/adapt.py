@@ -24,7 +24,7 @@ from vd.policy.agents import (
 )
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
-from vd.train.presets import PRESETS, TeacherCfg
+from vd.train.presets import TeacherCfg
 from vd.train.teacher import is_main, run_folder, say_of_main, train
 
 PAGE = "adapted.html"
@@ -191,7 +191,7 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     assert cfg.policy is not None and cfg.hand_layer is not None
     check_names([cfg.policy], cfg.objects)
     try:
-        base = settings_of(cfg.policy, PRESETS["gpu"]())
+        base = settings_of(cfg.policy)
     except ValueError as error:
         raise ValueError(
             f"{error}; adapt goes on with settings of a teacher's own; with others: vd-train teacher "

@@ -81,7 +81,7 @@ def read_start(path: Path, device: str = "cpu") -> dict[str, Any]:
     return state | ({"critic_state_dict": policy.critic} if policy.critic else {})
 
 
-def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
+def settings_of(name: str) -> "TeacherCfg":
     """Settings of the training of what a run begins from, for one that asks for no preset.
 
     Raises:
@@ -90,12 +90,14 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     """
     from vd.envs.cfg import ReorientCfg
     from vd.train.config import PolicyCfg, PpoCfg
+    from vd.train.presets import gpu
 
     path = find_start(name)
     state = read_start(path)
     if not state["learner"]:
         raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
+        base = gpu()
         task = ReorientCfg.of_task(state["task"])
         env = replace(task, curriculum=base.env.curriculum)
         learner = state["learner"]

@@ -101,9 +101,8 @@ def prune_checkpoints(run_dir: Path, newest: int) -> None:
     What a run that went on from an older checkpoint finds after that stays.
     """
     last = checkpoint_path(run_dir, newest)
-    for path in [path for path in list_checkpoints(run_dir) if path <= last][:-KEEP_LAST]:
-        path.unlink(missing_ok=True)
-    for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
+    old = [path for path in list_checkpoints(run_dir) if path <= last][:-KEEP_LAST]
+    for path in (*old, *(run_dir / CHECKPOINT_FOLDER).glob(".*.pt")):
         path.unlink(missing_ok=True)
 
 
@@ -152,10 +151,11 @@ def without_worlds(state: dict[str, Any]) -> dict[str, Any]:
     Networks, optimiser, curriculum and counters stay; a run that goes on from it starts its
     episodes anew.
     """
-    kept = [
-        {"env": {key: v for key, v in rank["env"].items() if key != _WORLDS}}
-        for rank in state["ranks"]
-    ]
+    kept = []
+    for rank in state["ranks"]:
+        env = dict(rank["env"])
+        env.pop(_WORLDS, None)
+        kept.append({"env": env})
     return state | {"ranks": kept}
 
 

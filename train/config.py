@@ -53,9 +53,6 @@ class PpoCfg:
     launching some hundred kernels takes longer than running them, as on busy processors. Ignored on
     a CPU.
     """
-    failure_floor: float | None = None
-    """What a sample weighs beside the share of goals that are missed with its object: the less, the
-    more do objects count with which much is missed. None: all samples weigh the same."""
 
 
 @dataclass
@@ -124,7 +121,7 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     require(ppo, "--ppo.", "positive", "rollout_steps minibatch_size epochs clip grad_norm")
     rates = "actor_learning_rate critic_learning_rate"
     require(ppo, "--ppo.", "positive", f"{rates} desired_kl late_kl")
-    require(ppo, "--ppo.", "zero or positive", "bound_coefficient failure_floor")
+    require(ppo, "--ppo.", "zero or positive", "bound_coefficient")
     require(ppo, "--ppo.", "in [0, 1]", "gamma gae_lambda")
     if not min(policy.hidden, default=0) > 0:
         raise ValueError(f"--policy.hidden is {policy.hidden}; widths have to be positive")

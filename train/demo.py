@@ -152,6 +152,7 @@ class Demo:
         self.cfg = cfg
         self.page = cfg.out / "index.html"
         self.started = time.monotonic()
+        self.seed = ("--seed", str(cfg.seed))
         parts = [
             Part("camera", "Objects never seen, turned by camera", self.camera, cfg.out),
             Part("gap", "A hidden effect, found and closed", self.gap, cfg.out),
@@ -208,7 +209,7 @@ class Demo:
         film = part.folder / "film.mp4"
         if self.cfg.meshes is not None:
             self.objects = import_meshes(part, self.cfg.meshes)
-        options = (self.policy, "--objects", *self.objects, "--seed", str(self.cfg.seed))
+        options = (self.policy, "--objects", *self.objects, *self.seed)
         part.run("vd-eval", *options, "--episodes", str(EPISODES), "--out", part.folder)
         shown = ("--cells", str(SHOWN), "--seconds", str(FILM_S))
         part.run("vd-play", *options, *shown, "--video", film)
@@ -240,9 +241,8 @@ class Demo:
         """An effect hidden in a simulated servo, found and closed."""
         recording = part.folder / "recording"
         analysis = part.folder / "analysis"
-        seed = ("--seed", str(self.cfg.seed))
-        part.run("vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, *seed)
-        part.run("vd-gap", "run", recording, "--out", analysis, *seed)
+        part.run("vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, *self.seed)
+        part.run("vd-gap", "run", recording, "--out", analysis, *self.seed)
         from vd.api import gap_verdict
 
         verdict = gap_verdict(analysis / "report.json")
@@ -261,8 +261,8 @@ class Demo:
         """A simulated hand behind the protocol of its motors, with the policy that sees."""
         log = part.folder / "log"
         hand = ("--hand", HAND, "--twin", "--object", self.first_object())
-        options = ("--seed", str(self.cfg.seed), "--safety.misses", MISSES)
-        part.run("vd-deploy", self.policy, *hand, *options, "--log", log)
+        options = ("--safety.misses", MISSES, "--log", log)
+        part.run("vd-deploy", self.policy, *hand, *self.seed, *options)
         from vd.logs.hand_log import read_log
 
         run = read_log(log)
@@ -281,10 +281,10 @@ class Demo:
         run = part.folder / "run"
         film = part.folder / "film.mp4"
         minutes = max(self.cfg.minutes - self.minutes - AROUND_TRAINING_MIN, LEAST_TRAINING_MIN)
-        seed = ("--seed", str(self.cfg.seed))
-        length = ("--max-minutes", f"{minutes:.2f}")
-        part.run("vd-train", "teacher", "--preset", "cpu-demo", *TASK, *seed, *length, "--out", run)
-        part.run("vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film)
+        task = ("--preset", "cpu-demo", *TASK, "--max-minutes", f"{minutes:.2f}")
+        part.run("vd-train", "teacher", *task, *self.seed, "--out", run)
+        shown = ("--cells", "4", "--seconds", str(FILM_S))
+        part.run("vd-play", run, *shown, *self.seed, "--video", film)
         from vd.train.metrics import PROGRESS_FILE, read_progress
 
         rows = settled(read_progress(run / PROGRESS_FILE))

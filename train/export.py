@@ -56,7 +56,11 @@ def export_command(arguments: list[str]) -> int:
     check_suffix(cfg.output, *([".pt"] if cfg.resumable else [SUFFIX, ONNX_SUFFIX]))
     check_file(cfg.output)
     if cfg.resumable:
-        _export_checkpoint(Path(cfg.policy), cfg.output)
+        from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
+
+        state = load_checkpoint(Path(cfg.policy), flag="vd-train export")
+        save_checkpoint(cfg.output, without_worlds(state))
+        print(cfg.output)
         return 0
     from vd.policy.agents import find_policy, open_policy
     from vd.policy.bundle import write_policy
@@ -71,14 +75,6 @@ def export_command(arguments: list[str]) -> int:
         write_policy(policy, cfg.output, contract)
     print(f"{cfg.output}: {contract.kind} for {policy.hand}, {policy.num_actions} motors")
     return 0
-
-
-def _export_checkpoint(path: Path, output: Path) -> None:
-    """Write a checkpoint without what it simulates."""
-    from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
-
-    save_checkpoint(output, without_worlds(load_checkpoint(path, flag="vd-train export")))
-    print(output)
 
 
 def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
@@ -106,21 +102,14 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
         raise ValueError(f"{path}: sparse convolutions are not exported to ONNX; name a {SUFFIX}")
     interrupt.need("onnx", "onnxscript")
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
-    drawn = torch.randn(
-        CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0)
-    )
-    _export(
-        teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy, contract)
-    )
+    rng = torch.Generator().manual_seed(0)
+    drawn = {"observation": torch.randn(CHECKED, teacher.num_observations, generator=rng)}
+    _export(teacher.network, drawn, ["action"], path, onnx_metadata(policy, contract))
     if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
         _have_exported(Residual)
-        clouds = CLOUD_M * torch.randn(
-            2, CHECKED, POINTS, 3, generator=torch.Generator().manual_seed(0)
-        )
-        named = {
-            "goal_points": clouds[0],
-            "seen_points": clouds[1, :, : POINTS - 1],
-        }  # of another number
+        clouds = CLOUD_M * torch.randn(2, CHECKED, POINTS, 3, generator=rng)
+        seen = clouds[1, :, : POINTS - 1]  # of another number
+        named = {"goal_points": clouds[0], "seen_points": seen}
         outputs = [field.name for field in fields(Residual)]
         _export(policy.alignment, named, outputs, path.with_stem(f"{path.stem}-alignment"))
 

@@ -14,7 +14,7 @@ from vd.command.device import resolve_device
 from vd.command.files import write_json
 from vd.command.line import PRINT, ConfigFile, parse, take_config
 from vd.policy.agents import DEFAULT_POLICY, check_names, installed_policies
-from vd.train.begin import settings_of
+from vd.train.begin import find_start, read_start, settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
@@ -83,18 +83,19 @@ def parse_teacher(
             ``--init`` is no teacher.
     """
     arguments, file = starting(normalise(arguments, SHORT_FORMS))
-    preset, init, resume = (
-        value_of(arguments, flag) for flag in ("--preset", "--init", "--resume")
-    )
+    preset = value_of(arguments, "--preset")
+    init = value_of(arguments, "--init")
+    resume = value_of(arguments, "--resume")
     out = value_of(arguments, "--out")
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
+    small = "--smoke" in arguments
     if preset is not None and preset not in PRESETS:
         raise ValueError(f"--preset {preset} is none; one of {', '.join(PRESETS)}")
     chosen = False
-    if "--smoke" in arguments:
-        start = smoke(PRESETS[preset or "cpu-demo"]())
-    elif preset is None and init is not None:
-        start = settings_of(init, PRESETS["gpu"]())
+    if preset is None and init is not None:
+        start = settings_of(init)
+    elif small:
+        start = PRESETS[preset or "cpu-demo"]()
     elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
         _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](), file)
@@ -103,6 +104,9 @@ def parse_teacher(
         start = PRESETS[preset]()
     else:
         start = PRESETS[preset or "gpu"]()
+    if small:
+        done = 0 if init is None else read_start(find_start(init))["env_steps"]
+        start = smoke(start, done)
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start
@@ -148,15 +152,14 @@ def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
     Raises:
         ValueError: Names the flag, what the run began with, and the remedy.
     """
-    for name in ("preset", "init", "stage", "smoke"):
-        flag = f"--{name}"
+    asked = {name: value_of(arguments, f"--{name}") for name in ("preset", "init", "stage")}
+    asked["smoke"] = "True" if "--smoke" in arguments else None
+    for name, value in asked.items():
         begun = getattr(saved, name, None)
-        asked = value_of(arguments, flag) if name != "smoke" else None
-        differs = asked is not None and asked != str(begun)
-        if differs or (name == "smoke" and flag in arguments and not begun):
+        if value not in (None, str(begun)):
             raise ValueError(
-                f"{flag} {asked or ''}: the run in {saved.run.out} began with {begun}, and goes on "
-                f"so; leave {flag} out, or choose another --out"
+                f"--{name} {value}: the run in {saved.run.out} began with {begun}, and goes on so; "
+                f"leave --{name} out, or choose another --out"
             )
 
 
@@ -174,12 +177,10 @@ def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[
             group, _, field = short_forms[name[3:] if off else name].rpartition(".")
             name = f"{group}.{'no-' if off else ''}{field}"
         result += [f"--{name}", value] if equals else [f"--{name}"]
-    for index, argument in enumerate(result):
-        if argument == "--resume" and (
-            index + 1 == len(result) or result[index + 1].startswith("--")
-        ):
-            result[index + 1 : index + 1] = ["latest"]
-            break
+    if "--resume" in result:
+        after = result.index("--resume") + 1
+        if after == len(result) or result[after].startswith("--"):
+            result.insert(after, "latest")
     return result
 
 

@@ -274,12 +274,13 @@ class TrainingLoop:
         if self.is_distributed:
             ranks = [None] * self.world_size
             torch.distributed.all_gather_object(ranks, mine)
-        counters = {
+        return self._shared_state() | {
+            "format": CHECKPOINT_FORMAT,
             "iter": self.iteration,
             "env_steps": self.env_steps,
             "elapsed_s": self._elapsed_s,
+            "ranks": ranks,
         }
-        return {"format": CHECKPOINT_FORMAT} | self._shared_state() | counters | {"ranks": ranks}
 
     def _restore(self, state: dict[str, Any]) -> None:
         """Take over counters, and environments and random state if they fit this run."""

@@ -23,27 +23,20 @@ class StepMeans:
 
     def __init__(self) -> None:
         self._names: tuple[str, ...] = ()
-        self._sum: torch.Tensor | None = None
-        self._steps = 0
+        self._steps: list[torch.Tensor] = []
 
     def add(self, log: dict[str, torch.Tensor]) -> None:
         """Add one step's scalars; every step has the same keys."""
-        values = torch.stack(tuple(log.values()))
-        if self._sum is None:
-            self._names = tuple(log)
-            self._sum = torch.zeros_like(values)
-        self._sum += values
-        self._steps += 1
+        self._names = tuple(log)
+        self._steps.append(torch.stack(tuple(log.values())))
 
     def clear(self) -> None:
         """Forget the steps so far."""
-        self._sum = None
-        self._steps = 0
+        self._steps.clear()
 
     def read(self, world_size: int = 1) -> dict[str, float]:
         """Means by name, averaged over the ranks, and start anew. Waits for the device."""
-        assert self._sum is not None, "no step was added"
-        mean = self._sum / self._steps
+        mean = torch.stack(self._steps).mean(dim=0)
         if world_size > 1:
             torch.distributed.all_reduce(mean)
             mean = mean / world_size
@@ -61,7 +54,7 @@ class GoalWindow:
 
     def __init__(self, length: int, *, success_ends: bool = False) -> None:
         self._success_ends = success_ends
-        self._rows: deque[tuple[float, float, float, float]] = deque(maxlen=max(1, length))
+        self._rows: deque[list[float]] = deque(maxlen=max(1, length))
 
     def add(self, means: dict[str, float]) -> dict[str, float | None]:
         """Take an iteration's means and give the window's ratios.
@@ -72,12 +65,12 @@ class GoalWindow:
             step.
         """
         self._rows.append(
-            (
+            [
                 means["task/reached"],
                 means["task/dropped"],
                 means["task/timed_out"],
                 means["reward/total"],
-            )
+            ]
         )
         reached, dropped, timed_out, reward = map(math.fsum, zip(*self._rows, strict=True))
         goals = reached + dropped + timed_out
@@ -96,12 +89,12 @@ class GoalWindow:
 
     def state_dict(self) -> list[list[float]]:
         """The rows, oldest first."""
-        return list(map(list, self._rows))
+        return list(self._rows)
 
     def load_state_dict(self, rows: list[list[float]]) -> None:
         """Restore :meth:`state_dict`."""
         self._rows.clear()
-        self._rows.extend((row[0], row[1], row[2], row[3]) for row in rows)
+        self._rows.extend(rows)
 
 
 class ProgressFile:
@@ -114,12 +107,11 @@ class ProgressFile:
     def __init__(self, run_dir: Path, logger: str = "tensorboard", *, done: int = 0) -> None:
         make_folder(run_dir)
         path = self._path = run_dir / PROGRESS_FILE
-        kept = (
-            [row for row in read_progress(path) if row["iteration"] <= done]
-            if path.is_file()
-            else []
-        )
-        write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
+        kept = ""
+        for row in read_progress(path) if path.is_file() else []:
+            if row["iteration"] <= done:
+                kept += f"{json.dumps(row)}\n"
+        write_text(path, kept)
         with writing(path):
             self._file = path.open("ab", buffering=0)
         self._board = None if logger == "none" else _board(run_dir, done)

@@ -74,7 +74,6 @@ class TeacherPPO(PPO):
             gradients go through Adam meanwhile, at a rate of zero: its first step then has moments
                 to go by,
             where one without would move every weight by the whole rate, whatever its gradient.
-        weights: What samples of each environment weigh, 1 in the mean, shape [N].
         samples: The latest rollout as rows, by name; observations begin with :data:`OBSERVED`.
     """
 
@@ -108,7 +107,6 @@ class TeacherPPO(PPO):
         )
         self.bound_coef = cfg.bound_coefficient
         self.actor_learns = True
-        self.weights = torch.ones(storage.num_envs, device=self.device)
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         # The rollout as rows of samples, in the same memory in every update, and the rows of a
         # minibatch.
@@ -190,7 +188,6 @@ class TeacherPPO(PPO):
             "log_prob": storage.actions_log_prob.flatten(),
             "advantages": storage.advantages.flatten(),
             "returns": storage.returns.flatten(),
-            "weights": self.weights.repeat(storage.num_transitions_per_env),
         }
         rollout |= {
             OBSERVED + key: value.flatten(0, 1) for key, value in storage.observations.items()
@@ -251,10 +248,9 @@ class TeacherPPO(PPO):
         ratio = torch.exp(log_ratio)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         advantages = batch["advantages"]
-        weights = batch["weights"]
-        surrogate = -(weights * torch.minimum(advantages * ratio, advantages * clipped)).mean()
+        surrogate = -torch.minimum(advantages * ratio, advantages * clipped).mean()
         errors = batch["returns"] - self.critic(observations).squeeze(-1)
-        value = (weights * errors.square()).mean()
+        value = errors.square().mean()
         excess = (self.actor.output_mean.abs() - ACTION_BOUND).clamp_min(0.0)
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
         if self.bound_coef:

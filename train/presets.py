@@ -55,8 +55,8 @@ class TeacherCfg:
     """Levels of the curriculum (goals, stillness, physics, air) at which a run with --init begins.
     None: those of what it begins from; 1 for a policy that does not say, the task as configured."""
     smoke: bool = False
-    """Check the installation: the preset, cpu-demo if none is named, tiny, on the CPU, for at most
-    a minute. It learns nothing, and keeps nothing unless --out is given."""
+    """Check the installation: the preset, or the training of what --init names, or cpu-demo, tiny, on
+    the CPU, for at most a minute. It learns nothing, and keeps nothing unless --out is given."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
     policy: PolicyCfg = field(default_factory=PolicyCfg)
@@ -323,12 +323,11 @@ def for_hand(cfg: TeacherCfg, hand: str | None) -> TeacherCfg:
     return replace(cfg, env=replace(cfg.env, observation=replace(cfg.env.observation, view="goal")))
 
 
-def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
-    """A preset, cpu-demo by default, shrunk to run all parts in at most a minute.
+def smoke(cfg: TeacherCfg, steps_before: int = 0) -> TeacherCfg:
+    """Settings shrunk to run all parts in at most a minute.
 
-    It learns nothing.
+    They learn nothing. What they begin from was trained for ``steps_before``.
     """
-    cfg = cfg or cpu_demo()
     return replace(
         cfg,
         smoke=True,
@@ -336,7 +335,7 @@ def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
             cfg.run,
             out=SMOKE_RUN,
             device="cpu",
-            max_steps=2048,
+            max_steps=steps_before + 2048,
             max_minutes=1.0,
             save_every=1,
             logger="none",
@@ -344,9 +343,8 @@ def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
         ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
         env=replace(
             cfg.env,
-            objects=("cube",),  # a set of many needs as many environments
+            objects=("cube",),  # of a policy's training they may not be here
             num_envs=16,
-            # Finding poses takes long.
-            start=replace(cfg.env.start, poses=1),
+            start=replace(cfg.env.start, poses=1),  # finding them takes long
         ),
     )

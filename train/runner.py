@@ -19,7 +19,6 @@ from vd.policy.contract import PolicySpec
 from vd.train.begin import check_fit, first_levels, read_start, take_critic, unlike
 from vd.train.checkpoint import BEST_NAME, POLICY_NAME, load_checkpoint, save_checkpoint
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
-from vd.train.failures import ObjectFailures
 from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.ppo import make_learner
@@ -37,7 +36,6 @@ class TeacherRunner(TrainingLoop):
 
     Attributes:
         critic_warmup: Iterations left in which the critic learns alone.
-        failures: Goals that are missed by object (``PpoCfg.failure_floor``); None: not counted.
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began
             from.
@@ -62,12 +60,12 @@ class TeacherRunner(TrainingLoop):
         self.task = task
         self.interface = interface or {}
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
-        self.failures: ObjectFailures | None = None
-        if ppo.failure_floor is not None:
-            self.failures = ObjectFailures(env.env.world_object, ppo.failure_floor, device)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means = StepMeans()
-        self.window = self._new_window()
+        # Two episodes, so that a window never misses the time-outs of environments that run in
+        # step.
+        length = math.ceil(2 * env.max_episode_length / ppo.rollout_steps)
+        self.window = GoalWindow(length, success_ends=bool(task.get("success_ends_episode")))
         """The newest goals, by which the best is chosen."""
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
@@ -111,8 +109,6 @@ class TeacherRunner(TrainingLoop):
         self.alg.actor.load_state_dict(state["actor_state_dict"])
         self.critic_warmup = take_critic(self.alg, state)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
-        if self.failures is not None and "failures" in state:
-            self.failures.load_state_dict(state["failures"])
         self.iteration = state["iter"]
         self.env_steps = state["env_steps"]
         self._elapsed_s = state.get("elapsed_s", 0.0)
@@ -200,17 +196,12 @@ class TeacherRunner(TrainingLoop):
                 observation, rewards, dones, extras = self.env.step(actions)
                 self.alg.process_env_step(observation, rewards, dones, extras)
                 self._means.add(extras["log"])
-                if self.failures is not None:
-                    self.failures.add(dones, self.env.reached)
             self.alg.compute_returns(observation)
         self.env.env.check()  # before an update makes something of what the simulation made
         return True
 
     def _update(self) -> dict[str, float]:
         """All epochs of PPO, or of the critic alone; its losses."""
-        if self.failures is not None:
-            self.failures.end_iteration(self.world_size)
-            self.alg.weights = self.failures.weights()
         self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
         self.critic_warmup = max(0, self.critic_warmup - 1)
@@ -218,12 +209,6 @@ class TeacherRunner(TrainingLoop):
             losses, self._networks, f"{LOWER_RATES}, or raise the lower end of --policy.std-range"
         )
         return losses
-
-    def _new_window(self) -> GoalWindow:
-        # Two episodes, so that a window never misses the time-outs of environments that run in
-        # step.
-        length = math.ceil(2 * self.env.max_episode_length / self.ppo.rollout_steps)
-        return GoalWindow(length, success_ends=bool(self.task.get("success_ends_episode", False)))
 
     def _spec(self) -> PolicySpec:
         """Shape of the actor."""
@@ -236,7 +221,7 @@ class TeacherRunner(TrainingLoop):
         )
 
     def _shared_state(self) -> dict[str, Any]:
-        state = {
+        return self.alg.save() | {
             "infos": None,
             "best": list(self._best) if self._best is not None else None,
             "window": self.window.state_dict(),
@@ -246,9 +231,6 @@ class TeacherRunner(TrainingLoop):
             "task": self.task,
             "interface": self.interface,
         }
-        if self.failures is not None:
-            state["failures"] = self.failures.state_dict()
-        return self.alg.save() | state
 
     def _take(self, state: dict[str, Any], path: str | Path) -> None:
         """Take over what was read from ``path``."""
@@ -260,8 +242,6 @@ class TeacherRunner(TrainingLoop):
                 f"it was trained with (its run folder's config.json), or start anew ({error})"
             ) from error
         self.critic_warmup = state.get("critic_warmup", 0)
-        if self.failures is not None and "failures" in state:
-            self.failures.load_state_dict(state["failures"])
         self._best = tuple(state["best"]) if state["best"] is not None else None
         self.window.load_state_dict(state["window"])
         self._restore(state)

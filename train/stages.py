@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from vd.command import interrupt
 from vd.command.device import resolve_device
 from vd.command.files import check_folder
 from vd.command.line import PRINT, ConfigFile, parse, say_same_as
@@ -24,7 +23,7 @@ from vd.train.flags import (
     value_of,
     write_config,
 )
-from vd.train.teacher import BUILDING, is_main, run_folder, say_of_main
+from vd.train.teacher import BUILDING, is_main, run_folder, say_of_main, train_to_end
 
 if TYPE_CHECKING:
     from vd.policy.actor import TrainedPolicy
@@ -128,7 +127,6 @@ def run_stage(training: StagedTraining[Cfg], arguments: list[str]) -> int:
 
 def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
     """Train as ``cfg`` says; the exit status."""
-    folder = cfg.run.out
     say = say_of_main()
     cfg.validate()
     trainer = training.build(cfg, say)
@@ -138,15 +136,7 @@ def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
         say(f"begins with the weights of {cfg.init}")
     elif cfg.stage:
         say(f"begins from nothing: stage {cfg.stage - 1} was not trained; --init names a network")
-    if not trainer.run_to_end():
-        if not cfg.smoke:
-            say(f"saved in {folder}; go on with: vd-train {training.name} --out {folder} --resume")
-        return interrupt.INTERRUPTED
-    if cfg.smoke:
-        say("done: everything runs, and the network is of no use")
-    else:
-        say(f"done: {folder / training.result}; tensorboard --logdir {folder} draws the curves")
-    return 0
+    return train_to_end(cfg, trainer, training.name, training.result, say)
 
 
 def task_of_teacher(

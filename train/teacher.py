@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from vd.command import interrupt
 from vd.command.config import to_dict
@@ -15,17 +15,15 @@ from vd.command.device import resolve_device
 from vd.command.files import check_folder, locked
 from vd.command.line import say_same_as
 from vd.command.warp_quiet import quiet_warp
+from vd.policy import SUFFIX
 from vd.train.begin import find_start, read_start
 from vd.train.config import validate
-from vd.train.flags import parse_teacher, write_config
+from vd.train.flags import Cfg, parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 
 if TYPE_CHECKING:
-    from vd.train.alignment.config import AlignmentTrainCfg
+    from vd.train.loop import TrainingLoop
     from vd.train.runner import TeacherRunner
-    from vd.train.student.config import StudentTrainCfg
-
-Cfg = TypeVar("Cfg", TeacherCfg, "AlignmentTrainCfg", "StudentTrainCfg")
 
 CPU_ENVS = 1024
 """Most environments of which a CPU simulates an iteration within a minute."""
@@ -139,46 +137,43 @@ def train(cfg: TeacherCfg, say: Callable[[str], None]) -> int:
 
     ``say`` as of :func:`build_teacher`.
     """
-    folder = cfg.run.out
     runner = build_teacher(cfg, say=say)
-    for line in _beginning(cfg, runner) if runner.iteration else []:
-        say(line)
-    if not runner.run_to_end():
-        if not cfg.smoke:
-            again = f"vd-train teacher --out {folder} --resume"
-            say(
-                f"saved in {folder}; go on with: "
-                f"{'the same command' if cfg.resume == 'auto' else again}"
-            )
-        return interrupt.INTERRUPTED
-    # It loads torch, which the first message should not wait for.
-    from vd.train.checkpoint import POLICY_NAME
+    if runner.iteration:
+        _say_beginning(cfg, runner, say)
+    return train_to_end(cfg, runner, "teacher", f"policy{SUFFIX}", say)
 
+
+def train_to_end(
+    cfg: Cfg, trainer: "TrainingLoop", name: str, result: str, say: Callable[[str], None]
+) -> int:
+    """Run a training of ``vd-train NAME`` whose ``result`` is a file in its folder; exit status."""
+    folder = cfg.run.out
+    whole = trainer.run_to_end()
     if cfg.smoke:
-        say(
-            f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no "
-            f"use"
-        )
-    elif not (folder / POLICY_NAME).exists():
-        say(
-            f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} "
-            f"steps done before are more than --max-steps {cfg.run.max_steps}; raise it"
-        )
+        if whole:
+            say("done: everything runs, and what was learned is of no use")
+    elif not whole:
+        again = f"vd-train {name} --out {folder} --resume"
+        if cfg.resume == "auto":
+            again = "the same command"
+        say(f"saved in {folder}; go on with: {again}")
+    elif (folder / result).exists():
+        say(f"done: {folder / result}; tensorboard --logdir {folder} draws the curves")
     else:
         say(
-            f"done: {folder}/{POLICY_NAME} is the best policy, tensorboard --logdir {folder} draws "
-            f"the curves"
+            f"done: nothing was trained, so {folder} has no {result}: the {trainer.env_steps} "
+            f"steps done before are more than --max-steps {cfg.run.max_steps}; raise it"
         )
-    return 0
+    return 0 if whole else interrupt.INTERRUPTED
 
 
-def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
-    """What a run that does not begin from nothing begins with."""
+def _say_beginning(cfg: TeacherCfg, runner: "TeacherRunner", say: Callable[[str], None]) -> None:
+    """Tell what a run that does not begin from nothing begins with."""
     how = f"begins from {cfg.init}" if runner.begun else "resumed"
-    yield f"{how} after iteration {runner.iteration} of {runner.total_iterations}"
-    if runner.new_episodes and not runner.begun:
-        yield f"episodes start anew: {runner.new_episodes}"
+    say(f"{how} after iteration {runner.iteration} of {runner.total_iterations}")
+    if runner.new_episodes:
+        say(f"episodes start anew: {runner.new_episodes}")
     if runner.critic_warmup:
-        yield f"the critic learns alone for {runner.critic_warmup} iterations"
+        say(f"the critic learns alone for {runner.critic_warmup} iterations")
     for difference in runner.unlike:
-        yield f"other than in the training of that policy: {difference}"
+        say(f"other than in the training of that policy: {difference}")

@@ -204,9 +204,8 @@ def _episodes(cfg: TrackerCfg, policy: "AnyCameraPolicy", device: str) -> "Trace
     assert cfg.episodes is not None
     each = math.ceil(cfg.episodes / count)
     envs = cfg.num_envs or envs_for(count, each, device, camera=True)
-    flags = {field.name: getattr(cfg, field.name) for field in fields(EpisodeFlags)} | {
-        "episodes": each
-    }
+    flags = {field.name: getattr(cfg, field.name) for field in fields(EpisodeFlags)}
+    flags["episodes"] = each
     evaluation = EvalCfg(policies=(cfg.teacher,), no_at_rest=True, **flags)
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)

@@ -82,11 +82,6 @@ class ReorientVecEnv(VecEnv):
     def episode_length_buf(self, value: torch.Tensor) -> None:
         self._step_count.copy_(value)
 
-    @property
-    def reached(self) -> torch.Tensor:
-        """1 where the goal was reached in the last step, int32 [N], a view."""
-        return self._success
-
     def get_observations(self) -> TensorDict:
         """The observation for the next action, ``{"policy": [N, O]}``, a copy on the device.
 

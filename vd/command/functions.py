@@ -1,9 +1,9 @@
 """Functions of a user by name, ``module:function``, also of modules of the working folder."""
 
-import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 
@@ -17,11 +17,10 @@ def named_function(name: str, what: str) -> Callable[..., Any]:
     Raises:
         ValueError: There is none.
     """
-    module, _, function = name.partition(":")
     here = str(Path.cwd())
     sys.path.append(here)
     try:
-        found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+        found: Callable[..., Any] = resolve_name(name)
     except Exception as error:
         raise ValueError(
             f"{what} {name!r} is not found ({error}); name it module:function, and run where "

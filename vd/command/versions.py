@@ -43,7 +43,7 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
 def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
     """What tells the code that measures from other code: a digest of its packages' statements.
 
-    Hands and their descriptions count too. Comments, docstrings and empty lines of modules do not,
+    Hands and their descriptions count too. Comments, docstrings and the form of modules do not,
     nor does where it is installed.
     """
     digest = hashlib.sha256()
@@ -64,15 +64,13 @@ def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
 
 
 def _statements(text: str) -> str:
-    """The lines of a module without comments, docstrings and empty lines."""
-    documented: set[int] = set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            assert node.end_lineno is not None
-            documented.update(range(node.lineno, node.end_lineno + 1))
-    lines = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        statement = line.split("  # ")[0].rstrip()
-        if number not in documented and statement and not statement.lstrip().startswith("#"):
-            lines.append(statement)
-    return "\n".join(lines)
+    """A module without comments, docstrings, and how its lines are broken."""
+    return ast.unparse(_WithoutDocstrings().visit(ast.parse(text)))
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    """Drops statements that are nothing but text."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:  # as ast calls it
+        """One statement."""
+        return None if isinstance(node.value, ast.Constant) else node

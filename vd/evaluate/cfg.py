@@ -20,22 +20,10 @@ from vd.sim.cfg import Engine
 
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
-OF_THE_SUITE = (
-    "episodes",
-    "max_goal_angle",
-    "at_rest",
-    "no_at_rest",
-    "stop_tolerance",
-    "episode_s",
-    "in_air",
-    "air_goals",
-    "consecutive",
-    "table_friction",
-    "condition",
-    "goals",
-    "sensor_errors",
-)
-"""Settings that a suite decides."""
+PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine")
+"""Settings beside ``--suite`` that every line of it gets."""
+BESIDE_SUITE = (*PASSED_ON, "policies", "objects", "suite", "jobs", "shard", "out")
+"""Settings that a suite does not decide."""
 EXCLUSIVE = (
     ("condition", "table_friction"),
     ("at_rest", "no_at_rest"),
@@ -240,8 +228,8 @@ class EvalCfg(HandFlags, EpisodeFlags):
             raise ValueError(
                 "--jobs and --shard are of a suite; add --suite paper, or leave them out"
             )
-        decided = [flag(name) for name in OF_THE_SUITE if self.suite and name in given]
-        if decided:
+        decided = [flag(name) for name in given if name not in BESIDE_SUITE]
+        if self.suite and decided:
             raise ValueError(
                 f"{' and '.join(decided)} is decided by --suite {self.suite}; leave it out"
             )

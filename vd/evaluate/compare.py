@@ -202,12 +202,10 @@ def actor_of(
     if not sees_clouds(policy):
         return policy, Agent(name, "teacher", "state", StoppingRule)
     from vd.command.workers import one_thread_without_gpu
-
-    one_thread_without_gpu(env.device)
-    settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
     from vd.evaluate.tracking import CameraActor
 
-    eyes = CameraActor(env, policy, **settings)
+    one_thread_without_gpu(env.device)
+    eyes = CameraActor(env, policy, goals=goals, sensor_errors=sensor_errors, seed=seed)
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
@@ -228,7 +226,6 @@ def planning(actor: Any, agent: "Agent", env: "ReorientEnv", seed: int) -> tuple
 
 def run_episodes(cfg: EvalCfg, env: "ReorientEnv", actor: Any, agent: "Agent") -> "Trace":
     """All episodes of one policy, with a progress bar."""
-    import numpy as np
     from tqdm import tqdm
 
     from vd.evaluate.rollout import draw_starts_and_goals, draw_turns
@@ -237,13 +234,9 @@ def run_episodes(cfg: EvalCfg, env: "ReorientEnv", actor: Any, agent: "Agent") -
     schedule = cfg.schedule
     draw: dict[str, Any] = {"seed": cfg.seed, "max_goal_angle": cfg.max_goal_angle}
     names = [item.name for item in env.objects]
-    starts = None
-    goals = None
+    starts = goals = turns = None
     if not env.cfg.start.at_rest:  # such starts are the environment's to draw
-        drawn = [draw_starts_and_goals(name, cfg.episodes, **draw) for name in names]
-        starts = np.stack([start for start, _ in drawn])
-        goals = np.stack([goal for _, goal in drawn])
-    turns = None
+        starts, goals = draw_starts_and_goals(names, cfg.episodes, **draw)
     if schedule.most > 1:
         turns = draw_turns(names, cfg.episodes, schedule.most, **draw)
     ways = agent.ways_to_stop(cfg.stop_tolerance, schedule).values()

@@ -114,7 +114,10 @@ def write_page(
     missing = []
     for condition, policy, why in result.missing:
         missing.append((condition, shown_name(policy), why))
-    objects = [(_heading(row), *_object_table(row)) for row in headlines]
+    objects = []
+    for row in headlines:
+        heading = f"{row.policy}, {_where(row)}, stopped by {row.stopped_by}"
+        objects.append((heading, *_object_table(row)))
     write_html(
         path,
         "evaluation.html",
@@ -290,10 +293,6 @@ def _bound_table(rows: Sequence[Row]) -> Table:
                 )
             )
     return _BOUND_HEADER, lines
-
-
-def _heading(row: Row) -> str:
-    return f"{row.policy}, {_where(row)}, stopped by {row.stopped_by}"
 
 
 def _where(row: Row) -> str:

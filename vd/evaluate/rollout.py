@@ -11,20 +11,25 @@ ANGLE_GRID = 4096
 
 
 def draw_starts_and_goals(
-    name: str, episodes: int, *, seed: int, max_goal_angle: float = np.pi
+    names: Sequence[str], episodes: int, *, seed: int, max_goal_angle: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the initial and goal orientations of one object.
+    """Draw the initial and goal orientations of objects.
 
-    They depend on the object's name, the seed and the number of the episode alone: not on the other
+    They depend on an object's name, the seed and the number of the episode alone: not on the other
     objects, the number of environments or the device. Starts are uniform on SO(3); goals are
     uniform on the part of SO(3) within ``max_goal_angle`` [rad], in (0, pi], of the start.
 
     Returns:
-        Starts and goals, quaternions xyzw, shapes [M, 4].
+        Starts and goals, quaternions xyzw, shapes [K, M, 4].
     """
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    start = Rotation.random(episodes, rng=rng).as_quat()
-    return start, draw_goals(start, rng, max_goal_angle)
+    starts = []
+    goals = []
+    for name in names:
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        start = Rotation.random(episodes, rng=rng).as_quat()
+        starts.append(start)
+        goals.append(draw_goals(start, rng, max_goal_angle))
+    return np.stack(starts), np.stack(goals)
 
 
 def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: float) -> np.ndarray:
@@ -64,14 +69,21 @@ def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> lis
             f"no environment simulates object {envs_of.argmin()}; raise the number of environments "
             f"to {objects}"
         )
-    place = np.zeros_like(world_object)  # of each environment among those of its object
-    for k in range(objects):
-        place[world_object == k] = np.arange(envs_of[k])
+    place = place_of(world_object)
     rounds = []
     for turn in range(int(np.ceil(episodes / envs_of.min()))):
         number = turn * envs_of[world_object] + place
         rounds.append(np.where(number < episodes, number, -1))
     return rounds
+
+
+def place_of(world_object: np.ndarray) -> np.ndarray:
+    """Place of each environment among those of its object, from 0, shape [N]."""
+    place = np.zeros_like(world_object)
+    for k in np.unique(world_object):
+        same = world_object == k
+        place[same] = np.arange(same.sum())
+    return place
 
 
 def unit_quats(quat: np.ndarray) -> np.ndarray:

@@ -66,9 +66,16 @@ class SpinResult:
         lines = [_HEADER]
         for row in self.rows:
             per_drop = NOTHING if row.per_drop is None else f"{row.per_drop:z.1f}"
-            figures = (f"{row.revolutions:z.2f} (sd {row.revolutions_sd:.2f})", per_drop)
-            held = (f"{100 * row.dropped:.0f} %", f"{row.held_s:.1f}")
-            lines.append((row.policy, row.object, *figures, *held))
+            lines.append(
+                (
+                    row.policy,
+                    row.object,
+                    f"{row.revolutions:z.2f} (sd {row.revolutions_sd:.2f})",
+                    per_drop,
+                    f"{100 * row.dropped:.0f} %",
+                    f"{row.held_s:.1f}",
+                )
+            )
         axis = " ".join(f"{value:g}" for value in self.axis)
         settings = f"{self.episode_s:g} s about {axis}, {self.rows[0].episodes} episodes in all"
         return f"{aligned(lines, words=2)}\n\n{settings}, condition {self.condition}"

@@ -6,7 +6,6 @@ What a folder holds already, measured with the same settings and the same policy
 import hashlib
 import json
 import math
-import re
 import shlex
 import sys
 import time
@@ -25,7 +24,7 @@ from vd.command.files import make_folder, write_json
 from vd.command.line import parse
 from vd.command.versions import code_fingerprint
 from vd.command.workers import run_tasks, shard
-from vd.evaluate.cfg import EvalCfg, parse_groups
+from vd.evaluate.cfg import PASSED_ON, EvalCfg, parse_groups
 from vd.evaluate.claims import claimed
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
@@ -41,13 +40,7 @@ from vd.evaluate.page import (
 )
 from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
-from vd.evaluate.suite import (
-    OWN_SETS,
-    Claim,
-    Suite,
-    SuiteEntry,
-    read_suite,
-)
+from vd.evaluate.suite import OWN_SETS, Claim, Suite, SuiteEntry, read_suite
 from vd.paper import PAPER
 from vd.policy.agents import find_policy, has_no_file, open_policy, sees_clouds
 
@@ -60,9 +53,6 @@ ASPECTS = (1.0, 2.0, 4.0, math.inf)
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "num_envs", "jobs", "shard")
-_PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine")
-"""Flags beside ``--suite`` that every line gets."""
-_GROUP = re.compile(r"([\w-]+)=SET\b")
 
 
 @dataclass(frozen=True)
@@ -120,7 +110,7 @@ def run_suite(cfg: EvalCfg) -> Result:
     assert cfg.suite is not None
     suite = read_suite(cfg.suite)
     wanted = groups_of(suite.lines)
-    groups = object_groups(cfg.objects, wanted, members=suite.members)
+    groups = object_groups(cfg.objects, wanted, suite.members)
     entries = [entry for entry in suite.lines if groups.keys() >= set(groups_of([entry]))]
     tasks = shard(make_tasks(cfg, entries, groups), cfg.shard)
     results: dict[tuple[str, str], Result] = {}
@@ -260,7 +250,10 @@ def groups_of(entries: Sequence[SuiteEntry]) -> list[str]:
     groups: list[str] = []
     for entry in entries:
         for line in entry.lines:
-            groups += _GROUP.findall(line)
+            for item in _parsed(line).objects:
+                group, _, name = item.partition("=")
+                if name == "SET":
+                    groups.append(group)
     return list(dict.fromkeys(groups))
 
 
@@ -278,7 +271,7 @@ def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, ObjectGroup
         else:
             objects.append(item)
     changes: dict[str, Any] = {}
-    for name in _PASSED_ON:
+    for name in PASSED_ON:
         value = getattr(cfg, name)
         if value != getattr(EvalCfg, name):
             changes[name] = value
@@ -293,10 +286,7 @@ def shown(entry: SuiteEntry) -> str:
 
 
 def object_groups(
-    objects: Sequence[str],
-    wanted: Sequence[str],
-    *,
-    members: Mapping[str, Sequence[str]] | None = None,
+    objects: Sequence[str], wanted: Sequence[str], members: Mapping[str, Sequence[str]]
 ) -> dict[str, ObjectGroup]:
     """The objects of each wanted group.
 
@@ -321,8 +311,8 @@ def object_groups(
             print(f"left out: {group}; give --objects {group}=SET", file=sys.stderr)
             continue
         files = set_files(sets)
-        if names := (members or {}).get(group):
-            files = _members(group, files, names)
+        if group in members:
+            files = _members(group, files, members[group])
             sets = tuple(map(str, files))
         text = f"{len(files)} of {shown_name(', '.join(given.get(group, sets)))}"
         if group not in given and group != "symmetric":

@@ -222,12 +222,10 @@ def record(
         held={way: np.full(shape, np.nan) for way in ways if schedule.hold_s},
     )
     for numbers, state in drawn_rounds(env, episodes, starts, goals):
-        if schedule.table_s is not None:
-            env.sim.place_table(present=True)
         env.load_state_dict(state)
         _Round(env, trace, numbers, goal_steps).run(policy, ways, tolerance, turns, on_step)
-    if schedule.table_s is not None:
-        env.sim.place_table(present=True)
+        if schedule.table_s is not None:
+            env.sim.place_table(present=True)
     return trace
 
 
@@ -313,9 +311,9 @@ class _Round:
         self._exact = np.zeros(env.num_envs)
         # The state in which each way to stop ends an environment, after how many steps; -1: not
         # yet.
-        self._stopped = {
-            way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held
-        }
+        self._stopped: dict[Way, tuple[np.ndarray, dict[str, torch.Tensor]]] = {}
+        for way in trace.held:
+            self._stopped[way] = (np.full(env.num_envs, -1), motion_of(env, copy=True))
 
     def run(
         self,

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.command.files import atomic_path, write_json
+from vd.logs.log_format import POSE
 from vd.logs.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_header, read_table
 from vd.logs.recording_checks import RecordingError, require
 
 Kind = Literal["drop", "slide", "push", "press"]
-POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 PUSHER = ("pusher_x", "pusher_y", "pusher_z")
 FORCE = ("force_x", "force_y", "force_z")
 NEEDED: Mapping[str, tuple[str, ...]] = {
@@ -149,26 +149,25 @@ def _motion(
     table_frame: tuple[np.ndarray, Rotation],
     object_frame: tuple[np.ndarray, Rotation],
 ) -> ContactMotion:
-    names, rows = read_table(file)
+    table = read_table(file)
+    names = [name for name, _ in table]
     for name in NEEDED[kind]:
         require(
             names.count(name) == 1,
             f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it",
         )
+    cells = dict(table)
+    samples = len(cells["t"])
     require(
-        len(rows) >= MIN_SAMPLES,
-        f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again",
+        samples >= MIN_SAMPLES,
+        f"{file}: {samples} samples; at least {MIN_SAMPLES} are needed, record it again",
     )
 
     def vectors(wanted: tuple[str, ...]) -> np.ndarray:
         """Columns side by side [T, n], or empty [0, 3] where they were not recorded."""
-        if not set(wanted) <= set(names):
+        if not cells.keys() >= set(wanted):
             return np.empty((0, 3))
-        columns = []
-        for name in wanted:
-            place = names.index(name)
-            columns.append(numbers(file, name, [row[place] for row in rows]))
-        return np.stack(columns, axis=1)
+        return np.stack([numbers(file, name, cells[name]) for name in wanted], axis=1)
 
     time = vectors(("t",))[:, 0]
     pose = vectors(POSE)

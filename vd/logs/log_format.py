@@ -23,10 +23,12 @@ STEP_COLUMNS = (
 the goal that the stopping rule sees [rad]; how late the step began, and from its due time, the
 image's exposure, the state's reading and the sending of goals [s]; processor time of the process
 for this step [s]; deadlines missed so far."""
-TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "error")
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""Position [m] and quaternion."""
+TRUTH_COLUMNS = (*map("object.{}".format, POSE), "error")
 """Pose of the object and its angle to the goal, up to symmetry: a twin's only."""
 
-FOUND_COLUMNS = tuple(f"found.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+FOUND_COLUMNS = tuple(map("found.{}".format, POSE))
 """Pose of the object as a policy that sees by camera finds it; NaN where none was looked for."""
 
 FINISHED = "finished"

@@ -70,8 +70,12 @@ class Trajectory:
 
     def piece(self, first: int, end: int) -> "Trajectory":
         """Samples ``first`` to ``end`` (not included), with their times in the whole."""
-        arrays = {name: getattr(self, name) for name in ("time", "command_time", *CHANNELS)}
-        return replace(self, **{name: a[first:end] for name, a in arrays.items() if a is not None})
+        arrays = {}
+        for name in ("time", "command_time", *CHANNELS):
+            values = getattr(self, name)
+            if values is not None:
+                arrays[name] = values[first:end]
+        return replace(self, **arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +104,7 @@ class Recording:
         Args:
             pieces: Index of the trajectory -> samples ``(first, end)``.
         """
-        parts = enumerate(self.trajectories)
-        return replace(
-            self, trajectories=tuple(t.piece(*pieces[i]) if i in pieces else t for i, t in parts)
-        )
+        trajectories = list(self.trajectories)
+        for i, piece in pieces.items():
+            trajectories[i] = trajectories[i].piece(*piece)
+        return replace(self, trajectories=tuple(trajectories))

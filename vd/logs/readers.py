@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,17 +114,16 @@ def read_csv(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
     A folder: every CSV in it.
     """
     for file in _files(path, ".csv"):
-        header, rows = read_table(file)
         columns: dict[str, np.ndarray] = {}
         joints: dict[str, None] = {}
-        for i, text in enumerate(header):
+        for text, cells in read_table(file):
             name, scale = _column(file, text, options)
             if scale is None:
                 continue
             require(
                 name not in columns, f"{file}: two columns are {name!r}; --rename one to 'unused'"
             )
-            columns[name] = scale * numbers(file, text, [row[i] for row in rows])
+            columns[name] = scale * numbers(file, text, cells)
             _, dot, joint = name.partition(".")
             if dot:
                 joints[joint] = None
@@ -131,7 +131,7 @@ def read_csv(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
             "t" in columns,
             f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'",
         )
-        channels = by_channel(columns, tuple(joints), len(rows))
+        channels = by_channel(columns, tuple(joints), len(columns["t"]))
         yield SourceMotion(file.stem, tuple(joints), columns["t"], channels)
 
 
@@ -335,15 +335,18 @@ def _held(
     joints = _device_joints(path, states, options)
     states = [state for state in states if set(state.message.name) & set(joints)]
     stamped = all(message.header_s > 0.0 for message in (*states, *commands))
-    time, by_time = _in_time(states, stamped)
-    sent, by_sending = _in_time(commands, stamped)
+    clock = attrgetter("header_s" if stamped else "bag_s")
+    states = sorted(states, key=clock)
+    commands = sorted(commands, key=clock)
+    time = np.array(list(map(clock, states)))
+    sent = np.array(list(map(clock, commands)))
     position = []
     velocity = []
-    for state in by_time:
+    for state in states:
         names = state.message.name
         position.append(_in_order(path, names, state.message.position, joints))
         velocity.append(_in_order(path, names, state.message.velocity, joints))
-    goals = np.stack([_goal(path, command.message, joints) for command in by_sending])
+    goals = np.stack([_goal(path, command.message, joints) for command in commands])
     last = np.searchsorted(sent, time, side="right") - 1
     kept = last >= 0  # before the first command there is none
     time = time[kept]
@@ -369,15 +372,6 @@ def _device_joints(path: Path, states: list[StampedMessage], options: ReaderOpti
     raise RecordingError(
         f"{path}: no state of {', '.join(options.joints)}; there are {list(states[0].message.name)}"
     )
-
-
-def _in_time(
-    messages: list[StampedMessage], stamped: bool
-) -> tuple[np.ndarray, list[StampedMessage]]:
-    """Times [s] and messages in the order of time."""
-    times = np.array([m.header_s if stamped else m.bag_s for m in messages])
-    order = np.argsort(times, kind="stable")
-    return times[order], [messages[i] for i in order]
 
 
 def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:

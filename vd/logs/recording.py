@@ -283,8 +283,8 @@ def by_channel(
     return channels
 
 
-def read_table(file: Path) -> tuple[list[str], list[list[str]]]:
-    """Names of the columns and rows of cells of a CSV, separated by commas, semicolons or tabs.
+def read_table(file: Path) -> list[tuple[str, list[str]]]:
+    """Name and cells of each column of a CSV, separated by commas, semicolons or tabs.
 
     Beside semicolons a comma is the decimal point, as spreadsheets of many languages write it.
 
@@ -301,13 +301,13 @@ def read_table(file: Path) -> tuple[list[str], list[list[str]]]:
     while rows and not "".join(rows[-1]).strip():
         rows.pop()
     require(bool(rows), f"{file}: empty; record it again or drop it")
-    names = [name.strip() for name in rows[0]]
+    width = len(rows[0])
     for number, row in enumerate(rows, 1):
         require(
-            len(row) == len(names),
-            f"{file}: row {number} has {len(row)} cells, the header {len(names)}; correct the row",
+            len(row) == width,
+            f"{file}: row {number} has {len(row)} cells, the header {width}; correct the row",
         )
-    return names, rows[1:]
+    return [(name.strip(), cells) for name, *cells in zip(*rows, strict=True)]
 
 
 def numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
@@ -330,17 +330,18 @@ def numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
 
 def _read_columns(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The columns ``t`` and ``channel.joint`` of a trajectory, checked."""
-    names, rows = read_table(file)
-    _check_columns(file, names, joints)
+    table = read_table(file)
+    _check_columns(file, [name for name, _ in table], joints)
+    samples = len(table[0][1])
     require(
-        len(rows) >= MIN_SAMPLES,
-        f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, better some seconds at "
+        samples >= MIN_SAMPLES,
+        f"{file}: {samples} samples; at least {MIN_SAMPLES} are needed, better some seconds at "
         "100 Hz: record it again or drop it from 'trajectories'",
     )
     columns = {}
-    for index, name in enumerate(names):
+    for name, cells in table:
         if name in ("t", COMMAND_TIME) or name.partition(".")[0] in CHANNELS:
-            columns[name] = numbers(file, name, [row[index] for row in rows])
+            columns[name] = numbers(file, name, cells)
     if COMMAND_TIME in columns:
         columns = _without_repeats(columns)
     check_values(file, columns)

@@ -6,6 +6,7 @@ The checks of :mod:`vd.logs.recording` on values, beside those on the form of th
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -136,8 +137,11 @@ def check_motion(recording: Recording) -> None:
     )
     count = recording.encoder_resolution_rad
     for j, joint in enumerate(recording.joints):
-        driven = [t for t in recording.trajectories if t.enabled[:, j].all()]
-        moved = [t for t in driven if np.ptp(t.command[:, j]) > MIN_SAMPLES * count]
+        moved = [
+            t
+            for t in recording.trajectories
+            if t.enabled[:, j].all() and np.ptp(t.command[:, j]) > MIN_SAMPLES * count
+        ]
         if not moved:
             continue
         answers = np.array([np.ptp(t.position[:, j]) for t in moved])
@@ -218,14 +222,19 @@ def check_units(recording: Recording) -> None:
 def cautions(recording: Recording) -> tuple[str, ...]:
     """Plain sentences about what the recording cannot show well."""
     sentences = []
-    kinds: dict[str, set[str]] = {joint: set() for joint in recording.joints}
+    kinds: defaultdict[str, set[str]] = defaultdict(set)
     steps = []
     for t in recording.trajectories:
         steps.append(np.diff(t.time))
         for joint in t.joints:
             kinds[joint].add(t.excitation)
-    idle = [joint for joint in kinds if not kinds[joint]]
-    few = [joint for joint in kinds if 0 < len(kinds[joint]) < MIN_KINDS]
+    idle = []
+    few = []
+    for joint in recording.joints:
+        if not kinds[joint]:
+            idle.append(joint)
+        elif len(kinds[joint]) < MIN_KINDS:
+            few.append(joint)
     if idle:
         sentences.append(f"No motion moves {', '.join(idle)}: nothing is said about it.")
     if few:

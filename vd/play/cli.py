@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
 from vd.command import interrupt
@@ -130,7 +131,7 @@ def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C."""
     from vd.play.viewer import PlayViewer
 
-    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False)
+    viewer = PlayViewer(session, host=cfg.host, port=cfg.port)
     print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
     try:
         viewer.run()
@@ -140,12 +141,10 @@ def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
     """Environments to show: of different objects first, then more of the same."""
-    count: dict[int, int] = {}
-    rank = []
-    for index in world_object:
-        count[index] = count.get(index, 0) + 1
-        rank.append(count[index])
-    return sorted(sorted(range(len(rank)), key=rank.__getitem__)[:cells])
+    from vd.evaluate.rollout import place_of
+
+    first = place_of(np.asarray(world_object)).argsort(kind="stable")[:cells]
+    return sorted(first.tolist())
 
 
 def _session(cfg: PlayCfg) -> "Session":

@@ -3,8 +3,8 @@
 Newton's ray-traced camera on a model of its own.
 
 The picture model is separate from the simulated one: it has the visual shapes, one *cell* for every
-world that is shown (hand, table, object), and for every cell a second world with the object alone
-in the goal's orientation. Joint positions are all it needs, so a recording can be drawn later, or
+world that is shown (hand, table, object, and the object in the goal's orientation, high above where
+nothing else is). Joint positions are all it needs, so a recording can be drawn later, or
 elsewhere.
 
 World frame (z up, table top at z = 0), metres, radians, quaternions xyzw.
@@ -34,10 +34,13 @@ GHOST_OPACITY = 0.7
 # Light direction in the camera's right, forward (level) and up: from the upper left behind the
 # viewer, and low enough to reach under the palm.
 LIGHT_DIRECTION = (0.35, 0.9, -0.8)
+UP = (0.0, 0.0, 1.0)
 IN_PLACE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 """Pose, [m] and xyzw, of what is shown at the origin."""
 OUT_OF_SIGHT = (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
 """The same of what is hidden far below: viewers have no cheaper way to hide one shape."""
+GOAL_PLACE = (0.0, 0.0, 10.0)
+"""Where the goal's object is drawn for a picture of its own [m]: its shadow falls on no table."""
 BALL_SHARE = 0.8
 """Share of the picture's height that the ball takes at which a camera is aimed."""
 GOAL_SHARE = 0.36
@@ -78,7 +81,7 @@ class PictureCamera:
         """World from camera; the camera looks along -z, +x is right and +y is up. Shape [3, 3]."""
         forward = np.asarray(self.target, dtype=float) - np.asarray(self.eye, dtype=float)
         forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right = np.cross(forward, UP)
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(right, forward), -forward], axis=1)
 
@@ -106,14 +109,13 @@ class Picture(NamedTuple):
 class PictureModel:
     """The model of what is shown.
 
-    C cells, each with a hand (or none), a table and an object, and C goals.
+    C cells, each with a hand (or none), a table, an object, and it again as its goal.
 
     Args:
         hand: The hand; None shows objects alone.
         objects: The object of each cell, length C.
         device: Warp device.
-        ghost_in_scene: Put the goal's object, translucent, into the cell rather than in a world of
-            its own (for viewers that show one world).
+        goal_opacity: Of the goal's object.
     """
 
     def __init__(
@@ -122,13 +124,11 @@ class PictureModel:
         objects: Sequence[ObjectModel],
         *,
         device: str = "cpu",
-        ghost_in_scene: bool = False,
+        goal_opacity: float = 1.0,
     ):
         cfg = SimCfg()
         self.cells = len(objects)
-        self.ghost_in_scene = ghost_in_scene
         scene = new_builder()
-        ghosts = []
         hand_builder = build_hand(hand, cfg, visuals=True) if hand else None
         for item in objects:
             world = new_builder()
@@ -140,17 +140,11 @@ class PictureModel:
                 mass=1.0, inertia=wp.mat33(np.eye(3)), label=TABLE_LABEL, lock_inertia=True
             )
             show_table(world, cfg, table)
-            ghost = world if ghost_in_scene else new_builder()
-            body = add_object(ghost, item, cfg, scale=1.0, visuals=True)
-            visual = ghost.body_shapes[body][-1]
-            ghost.shape_color[visual] = GOAL_COLOR
-            if ghost_in_scene:
-                ghost.shape_opacity[visual] = GHOST_OPACITY
+            goal = add_object(world, item, cfg, scale=1.0, visuals=True)
+            visual = world.body_shapes[goal][-1]
+            world.shape_color[visual] = GOAL_COLOR
+            world.shape_opacity[visual] = goal_opacity
             scene.add_world(world)
-            ghosts.append(ghost)
-        if not ghost_in_scene:
-            for ghost in ghosts:
-                scene.add_world(ghost)
         self.model = scene.finalize(device=device)
         self.state = self.model.state()
 
@@ -158,7 +152,7 @@ class PictureModel:
         self,
         joint_q: np.ndarray,
         goal_quat: np.ndarray,
-        goal_position: Sequence[float] = (0.0, 0.0, 0.0),
+        goal_position: Sequence[float] = GOAL_PLACE,
         *,
         table: np.ndarray | bool = True,
     ) -> None:
@@ -172,11 +166,7 @@ class PictureModel:
         """
         goal = np.concatenate([np.tile(goal_position, (self.cells, 1)), goal_quat], axis=1)
         tables = np.where(np.broadcast_to(table, self.cells)[:, None], IN_PLACE, OUT_OF_SIGHT)
-        scene = np.concatenate([joint_q, tables], axis=1)
-        if self.ghost_in_scene:
-            q = np.concatenate([scene, goal], axis=1)
-        else:
-            q = np.concatenate([np.ravel(scene), np.ravel(goal)])
+        q = np.concatenate([joint_q, tables, goal], axis=1)
         self.state.joint_q.assign(np.ravel(q).astype(np.float32))
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
@@ -185,7 +175,7 @@ class Renderer:
     """Draws cells of hand and object, ``width`` by ``height`` pixels, with the goal beside each.
 
     Hand, objects and device are as of :class:`PictureModel`; the CPU is quick enough for video. The
-    picture of the goal is a square with sides of ``goal_size`` pixels, or GOAL_SHARE of the height.
+    picture of the goal is a square with sides of GOAL_SHARE of the height.
     """
 
     def __init__(
@@ -195,24 +185,23 @@ class Renderer:
         *,
         width: int = 640,
         height: int = 400,
-        goal_size: int | None = None,
         camera: PictureCamera | None = None,
         device: str = "cpu",
     ):
-        self.width = width
-        self.height = height
         self.camera = camera or (PictureCamera.for_hand(hand) if hand else PictureCamera())
         self.pictured = PictureModel(hand, objects, device=device)
         cells = len(objects)
         self._sensor = SensorCamera(self.pictured.model)
-        self._sensor.create_default_light(enable_shadows=True, direction=_light(self.camera))
+        right = self.camera.rotation[:, 0]
+        axes = np.stack([right, np.cross(UP, right), UP])
+        light = wp.normalize(wp.vec3(*(LIGHT_DIRECTION @ axes)))
+        self._sensor.create_default_light(enable_shadows=True, direction=light)
         self._sensor.set_ambient_light(SKY, GROUND)
         radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
-        side = goal_size or round(GOAL_SHARE * height)
+        side = round(GOAL_SHARE * height)
 
-        def view(camera: PictureCamera, size: tuple[int, int], first_world: int) -> dict[str, Any]:
-            """What the sensor wants to know, and its buffers, to draw one world for each cell."""
-            worlds = list(range(first_world, first_world + cells))
+        def view(camera: PictureCamera, *size: int) -> dict[str, Any]:
+            """What the sensor wants to know, and its buffers, to draw each cell."""
             return {
                 "camera_transforms": wp.array(
                     [camera.transform] * cells, dtype=wp.transformf, device=device
@@ -221,13 +210,11 @@ class Renderer:
                     *size, camera_fov=camera.fov, device=device
                 ),
                 "color_image": self._sensor.allocate_image_color(cells, *size),
-                "world_indices": wp.array(worlds, dtype=wp.int32, device=device),
+                "world_indices": wp.array(list(range(cells)), dtype=wp.int32, device=device),
             }
 
-        goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
-        scene_view = view(self.camera, (width, height), 0)
-        goal_view = view(goal_camera, (side, side), cells)
-        self._views = (scene_view, goal_view)
+        goal_camera = self.camera.aimed_at(GOAL_PLACE, radius)
+        self._views = (view(self.camera, width, height), view(goal_camera, side, side))
 
     def render(
         self, joint_q: np.ndarray, goal_quat: np.ndarray, table: np.ndarray | bool = True
@@ -262,10 +249,3 @@ class Renderer:
 def _vector(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
     x, y, z = map(float, values)
     return x, y, z
-
-
-def _light(camera: PictureCamera) -> wp.vec3:
-    up = np.array([0.0, 0.0, 1.0])
-    right = camera.rotation[:, 0]
-    axes = np.stack([right, np.cross(up, right), up])
-    return wp.normalize(wp.vec3(*(LIGHT_DIRECTION @ axes)))

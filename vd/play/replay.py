@@ -73,7 +73,8 @@ class Replay:
         pose = _pose_to_show(log)
         distance = columns["distance"]
         error = columns.get("error", distance)
-        sensed = columns.get("image_s", columns.get("sensed_s"))
+        image_s = columns["image_s"]
+        latency_s = columns["sent_s"] - np.where(np.isnan(image_s), columns["sensed_s"], image_s)
         ends = _goal_ends(log)
         goals = 0
         drops = 0
@@ -88,9 +89,6 @@ class Replay:
             believed = None  # while the hand is held
             if np.isfinite(distance[step]):
                 believed = float(distance[step])
-            latency_s = None
-            if sensed is not None:
-                latency_s = float(columns["sent_s"][step] - sensed[step])
             yield Snapshot(
                 name=self.object_name,
                 time_s=float(time[step] - time[0]),
@@ -103,7 +101,7 @@ class Replay:
                 drops=drops,
                 table=not self.hand.palm_up,
                 believed_rad=believed,
-                latency_s=latency_s,
+                latency_s=float(latency_s[step]),
             )
 
 

@@ -11,7 +11,7 @@ from vd.evaluate.rollout import draw_goals
 from vd.evaluate.statistics import symmetric_error
 from vd.evaluate.trace import advance
 from vd.play.camera_view import camera_view
-from vd.play.video import Snapshot, Watcher
+from vd.play.video import Watcher
 
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
@@ -49,9 +49,9 @@ class Session:
         index = self.object_names.index(name)
         self.world = list(self.env.world_object).index(index)
         self._watcher = Watcher(self.env, [self.world])
-        self.snapshot: Snapshot = self._watcher.read(stepped=False)[0]
+        self._look()
 
-    def step(self) -> Snapshot:
+    def step(self) -> None:
         """One control step of all environments."""
         begun = time.perf_counter()
         action = self._policy.act(wp.to_torch(self.env.observation))
@@ -67,23 +67,24 @@ class Session:
                 alike_rad=float(symmetric_error(shot.joint_q[-4:], shot.goal_quat, item.symmetry)),
             )
         self.snapshot = shot
-        return shot
 
     def view(self) -> np.ndarray:
         """What the policy's camera saw last, RGB bytes [H, W, 3]; with ``sees`` alone."""
         return camera_view(self._policy, self.world)
 
-    def reset(self) -> Snapshot:
+    def reset(self) -> None:
         """Start all environments anew, with new goals; counts go on."""
         self.env.reset()
-        self.snapshot = self._watcher.read(stepped=False)[0]
-        return self.snapshot
+        self._look()
 
-    def new_goal(self) -> Snapshot:
+    def new_goal(self) -> None:
         """Give every environment a new goal; nothing else changes."""
         env = self.env
         present = env.object_pose()[:, 3:7].astype(float)
         goals = draw_goals(present, self._rng, env.cfg.goal.max_angle_rad)
         env.give_goals(np.arange(env.num_envs), goals)
+        self._look()
+
+    def _look(self) -> None:
+        """Show what no step has changed."""
         self.snapshot = self._watcher.read(stepped=False)[0]
-        return self.snapshot

@@ -17,7 +17,7 @@ import warp as wp
 from newton.viewer import ViewerViser
 
 from vd.paper import PAPER
-from vd.play.render import PictureCamera, PictureModel
+from vd.play.render import GHOST_OPACITY, PictureCamera, PictureModel
 from vd.play.replay import Replay
 from vd.play.session import Session
 from vd.play.video import Snapshot
@@ -44,7 +44,6 @@ class PlayViewer:
         session: What is shown.
         host: Address.
         port: Port.
-        verbose: Whether Newton's viewer says that it begins.
     """
 
     def __init__(
@@ -53,9 +52,8 @@ class PlayViewer:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        verbose: bool = True,
     ):
-        self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
+        self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=False)
         options = self.viewer._viewer_option_handles
         for name in options.keys() - set(SHOWN_OPTIONS):
             options.pop(name).remove()
@@ -122,7 +120,7 @@ class PlayViewer:
         name = self.session.object_name
         if name not in self._models:
             item = self.session.objects[self.session.object_names.index(name)]
-            self._models[name] = PictureModel(self.session.hand, [item], ghost_in_scene=True)
+            self._models[name] = PictureModel(self.session.hand, [item], goal_opacity=GHOST_OPACITY)
         self._pictured = self._models[name]
         self.viewer.set_model(self._pictured.model)
 

@@ -14,8 +14,8 @@ from vd.policy.contract import (
     UNSEALED,
     Contract,
     ContractError,
-    contract_in,
     contract_text,
+    installed_contract,
     read_sealed,
     sealed,
 )
@@ -77,7 +77,8 @@ def read_contract(path: str | Path) -> Contract:
         FileNotFoundError: There is no such file.
         ContractError: It is damaged, no policy, or of another version.
     """
-    return contract_in(read_sealed(Path(path)), path)
+    read_sealed(Path(path))
+    return installed_contract(path)
 
 
 def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
@@ -95,7 +96,7 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
     if not has_suffix(path, SUFFIX):
         return teacher_in(read_state(path, device, remedy=REMEDY), path, device)
     data = read_sealed(Path(path))
-    contract = contract_in(data, path)
+    contract = installed_contract(path)
     tensors = load(data)
     golden = _part(tensors, "golden.")
     try:

@@ -189,32 +189,21 @@ def contract_of(text: str, where: str | Path) -> Contract:
     return contract
 
 
-def contract_in(data: bytes, where: str | Path) -> Contract:
-    """The contract in the content of a policy's file, or in its begin up to the first weights.
-
-    Raises:
-        ContractError: There is none, or it is of another format.
-    """
-    length = int.from_bytes(data[:8], "little")
-    try:
-        header = json.loads(data[8 : 8 + length])
-        text = header["__metadata__"][CONTRACT_KEY]
-    except (ValueError, TypeError, KeyError) as error:
-        raise ContractError(f"{where} is damaged, or no policy; copy it again") from error
-    return contract_of(text, where)
-
-
-def installed_contract(path: Path) -> Contract:
+def installed_contract(path: str | Path) -> Contract:
     """What a policy's file says of it; its weights are not read.
 
     Raises:
         OSError: It cannot be read.
         ContractError: It is damaged, no policy, or of another version.
     """
-    with path.open("rb") as file:
-        length = file.read(8)
-        header = file.read(int.from_bytes(length, "little"))
-    return contract_in(length + header, path)
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "numpy") as file:
+            text = file.metadata()[CONTRACT_KEY]
+    except (SafetensorError, TypeError, KeyError) as error:
+        raise ContractError(f"{path} is damaged, or no policy; copy it again") from error
+    return contract_of(text, path)
 
 
 def without_folders(contract: Contract) -> Contract:

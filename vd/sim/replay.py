@@ -5,6 +5,8 @@ Every world replays one trajectory with one set of parameters. Contacts are off;
 
 import dataclasses
 import math
+from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import mujoco
@@ -86,24 +88,29 @@ class _Replay:
         self.shape = (worlds, hand.num_joints)
         self._load(recording, models)
         self._build()
+        zeros = partial(wp.zeros, device=device)
         most = max(len(t.time) for t in recording.trajectories)
-        self.positions = wp.zeros((worlds, most, hand.num_joints), dtype=float, device=device)
-        self._step = wp.zeros(1, dtype=wp.int32, device=device)
+        self.positions = zeros((worlds, most, hand.num_joints), dtype=float)
+        self._step = zeros(1, dtype=wp.int32)
         # Of every joint the next sample to command and to write, and what is commanded now.
-        self._write = wp.zeros(self.shape, dtype=wp.int32, device=device)
-        self._read = wp.zeros(self.shape, dtype=wp.int32, device=device)
-        self._due_step = wp.zeros(self.shape, dtype=wp.int32, device=device)
-        self._due_fraction = wp.zeros(self.shape, dtype=float, device=device)
-        self._held = wp.zeros(self.shape, dtype=float, device=device)
-        self._held_power = wp.zeros(self.shape, dtype=float, device=device)
+        self._write = zeros(self.shape, dtype=wp.int32)
+        self._read = zeros(self.shape, dtype=wp.int32)
+        self._due_step = zeros(self.shape, dtype=wp.int32)
+        self._due_fraction = zeros(self.shape, dtype=float)
+        self._held = zeros(self.shape, dtype=float)
+        self._held_power = zeros(self.shape, dtype=float)
 
     def _load(self, recording: Recording, models: int) -> None:
         """Put the trajectories on the device, one after the other."""
         trajectories = recording.trajectories
         lengths = np.array([len(t.time) for t in trajectories])
         first = np.cumsum(lengths) - lengths
-        command = np.concatenate([t.command for t in trajectories])
-        position = np.concatenate([t.position for t in trajectories])
+
+        def joined(name: str) -> np.ndarray:
+            """What trajectories have by this name, one after the other."""
+            return np.concatenate(list(map(attrgetter(name), trajectories)))
+
+        command = joined("command")
         power = _power(recording)
         names = recording.joints
         column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
@@ -118,13 +125,11 @@ class _Replay:
             return np.tile(np.where(self._recorded, values[first][:, column], idle), (models, 1))
 
         centre = np.clip(0.0, self.hand.lower, self.hand.upper)
-        self._start = start(position, centre)
+        self._start = start(joined("position"), centre)
         self._start_command = start(command, centre)
         self._start_power = start(power, 1.0)
-        step, fraction = np.divmod(np.concatenate([t.time for t in trajectories]) / self.dt, 1.0)
-        sent_step, sent_fraction = np.divmod(
-            np.concatenate([t.sent for t in trajectories]) / self.dt, 1.0
-        )
+        step, fraction = np.divmod(joined("time") / self.dt, 1.0)
+        sent_step, sent_fraction = np.divmod(joined("sent") / self.dt, 1.0)
         self._samples = Samples()
         self._samples.step = array(step, int)
         self._samples.fraction = array(fraction)
@@ -159,8 +164,11 @@ class _Replay:
         self.solver.mjw_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.control = self.model.control()
         self._states = (self.model.state(), self.model.state())
-        self._q = [state.joint_q.reshape((worlds, -1)) for state in self._states]
-        self._qd = [state.joint_qd.reshape((worlds, -1)) for state in self._states]
+        self._q = []
+        self._qd = []
+        for state in self._states:
+            self._q.append(state.joint_q.reshape((worlds, -1)))
+            self._qd.append(state.joint_qd.reshape((worlds, -1)))
         self.servo = JointServo(
             self.solver,
             self.control,

@@ -96,6 +96,11 @@ def new_builder() -> newton.ModelBuilder:
     return builder
 
 
+def last_part(label: str) -> str:
+    """A label of Newton's without those of what it belongs to."""
+    return label.rsplit("/", 1)[-1]
+
+
 def contact_attributes(priority: int, condim: int = CONDIM_SLIDING) -> dict[str, object]:
     """MuJoCo attributes of a collision shape."""
     d0, dmax = TABLE_IMPEDANCE if priority == PRIORITY_TABLE else CONTACT_IMPEDANCE
@@ -173,12 +178,10 @@ def _group_fingers(builder: newton.ModelBuilder, hand: HandModel) -> None:
     ]
     if len(colliding) <= MASKED_SHAPES:
         return
-    names = [label.rsplit("/", 1)[-1] for label in builder.body_label]
+    names = list(map(last_part, builder.body_label))
     apart = set(builder.shape_collision_filter_pairs)
     for finger, joints in enumerate(hand.fingers):
-        links = [
-            hand.link_names[hand.joint_child[joint]] for joint in range(joints.start, joints.stop)
-        ]
+        links = [hand.link_names[child] for child in hand.joint_child[joints]]
         shapes = [i for i in colliding if names[builder.shape_body[i]] in links]
         pairs = [
             (a, b)
@@ -346,7 +349,7 @@ def build_scene(
             worlds.append((world, int(copies)))
     model = scene.finalize(device=device)
     bodies = model.body_count // num_envs
-    names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
+    names = list(map(last_part, model.body_label[:bodies]))
     object_body = names.index(OBJECT_LABEL) if objects else -1
     return Scene(
         model=model,
@@ -366,7 +369,7 @@ def shape_kinds(model: newton.Model, bodies: int, object_body: int) -> np.ndarra
     """SHAPE_* of the shapes of a model with so many bodies a world, shape [S]."""
     shape_body = model.shape_body.numpy()
     on_object = (shape_body >= 0) & (shape_body % bodies == object_body)
-    is_table = [label.rsplit("/", 1)[-1] == TABLE_LABEL for label in model.shape_label]
+    is_table = np.array(list(map(last_part, model.shape_label))) == TABLE_LABEL
     kind = np.where(on_object, SHAPE_OBJECT, np.where(is_table, SHAPE_TABLE, SHAPE_HAND))
     collides = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0
     return np.where(collides, kind, SHAPE_OTHER).astype(np.int32)

@@ -17,7 +17,7 @@ from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
 from vd.sim.joint_servo import JointServo
 from vd.sim.pair_order import sort_pairs
-from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
+from vd.sim.scene import SHAPE_OBJECT, SHAPE_OTHER, SHAPE_TABLE, Scene
 
 # Faster than any joint (8 rad/s) or dropped object (2 m/s) can be; an object that spins faster than
 # this is a solver failure on its way to NaN.
@@ -82,7 +82,6 @@ class Simulator:
         if self.device.is_cuda:  # a processor has no warps that would wait
             sort_pairs(self.solver.mjw_model, self.solver.mjw_data)
         self._observables = self.solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW})
-        self._overflow_mask = sum(OVERFLOW_REMEDY)
 
         def per_env(state: newton.State) -> list[wp.array]:
             arrays = state.joint_q, state.joint_qd, state.body_q, state.body_qd, state.body_f
@@ -96,15 +95,11 @@ class Simulator:
         self.servo: JointServo | None = None
         """The identified servos, or None: then ``target`` goes to the solver's drives as it is."""
 
-        def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
-            return wp.array(values, dtype=dtype, device=self.device)
-
-        self.velocity_limit = array(scene.hand.velocity_limit, wp.float32)
+        self.velocity_limit = wp.array(scene.hand.velocity_limit, dtype=float, device=self.device)
         """Joint speed limits [rad/s], shape [D]."""
         geom_shape = self.solver.mjc_geom_to_newton_shape.numpy()
-        self._geom_kind = array(
-            np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32)
-        )
+        kind = np.where(geom_shape >= 0, scene.shape_kind[geom_shape], SHAPE_OTHER)
+        self._geom_kind = wp.array(kind, dtype=wp.int32, device=self.device)
         self.table_force = wp.zeros(n, dtype=float, device=self.device)
         """Normal force between object and table at the end of the control step [N], shape [N]."""
         self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
@@ -199,7 +194,7 @@ class Simulator:
             dim = self.num_envs, len(self.velocity_limit)
             limits = [self.velocity_limit, self.cfg.physics_dt, previous_q]
             launch(limit_joint_velocity_kernel, dim, limits, [q, qd])
-        raised = [self._observables.overflow, self._overflow_mask]
+        raised = [self._observables.overflow, sum(OVERFLOW_REMEDY)]
         launch(collect_overflow_kernel, self.num_envs, raised, [self.overflow])
 
     def _table_contact(self) -> None:
