@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,8 +27,10 @@ from vd.deploy.hardware.joints import read_joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 
-PATIENT = SafetyCfg(lost_s=2.0, misses=12, hold_s=0.3)
+PATIENT = SafetyCfg(lost_s=20.0, misses=240, watchdog_s=2.5, hold_s=0.3)
 """For a machine with other work: late steps are not what is tried here."""
+HANGING = replace(PATIENT, misses=12)
+"""Where they are: a second."""
 IMPATIENT = (0.0, 0.03, *[0.01] * 40)
 """Pauses between signals of somebody who leans on the keys: some come while motors are asked [s]."""
 END_S = 20.0
@@ -43,12 +46,13 @@ def drive(path: str, what: str, words: str) -> None:
     @interrupt.command("vd-deploy")
     def run() -> int:
         if what == "home":
-            flags = ["--port", path, "--yes", "--speed", "0.02", "--safety.lost-s", "2"]
-            return int(cli.main.__wrapped__(["home", *flags, "--safety.misses", "12"]))
+            flags = ["--port", path, "--yes", "--speed", "0.02", "--safety.lost-s", "20"]
+            flags += ["--safety.misses", "240", "--safety.watchdog-s", "2.5"]
+            return int(cli.main.__wrapped__(["home", *flags]))
         joints = read_joints(load_hand("dclaw3"))
         with MotorBus(path, joints.ids, joints.models, retries=5) as bus:
             bus.configure(joints.settings())
-            with SafeHand(bus, joints, PATIENT) as safe:
+            with SafeHand(bus, joints, HANGING if what == "hang" else PATIENT) as safe:
                 safe.arm()
                 for _ in range(round(60.0 / PERIOD_S)):
                     safe.command(safe.read().position)
@@ -140,7 +144,7 @@ def test_no_signal_cuts_off_the_stop(driver, number, pauses):
 
 def test_a_command_is_stopped_whole(driver):
     driven = driver("home")
-    assert driven.press(signal.SIGINT, *IMPATIENT) == 130
+    assert driven.press(signal.SIGINT, *IMPATIENT) == 130, driven.words()
     assert energised(driven.twin) == [] and "stopped: Ctrl-C; torque off" in driven.words()
 
 

@@ -28,9 +28,7 @@ from vd.vision.student import Flow, Look, Student, rigid_motion
 
 JOINTS = 9
 TIPS = 3
-SMALL = StudentCfg(
-    channels=(8, 16), blocks=1, embedding=32, flow=32, senses=16, memory=32, head=32, voxel_m=0.01
-)
+SMALL = StudentCfg(channels=(8, 16), blocks=1, flow=32, senses=16, memory=32, head=32, voxel_m=0.01)
 
 
 def box_clouds(count: int, points: int, generator: torch.Generator) -> torch.Tensor:
@@ -106,10 +104,10 @@ def test_what_it_says_depends_on_every_thing_that_it_reads():
 def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
     network = student()
     steps = [sights((3,), seed) for seed in range(4)]
-    features = torch.stack([network.look(sight).features for sight in steps])
+    told = torch.stack([network.look(sight).told for sight in steps])
     done = torch.zeros((4, 3), dtype=torch.bool)
     done[1, 0] = done[3, 2] = True
-    whole = network(features, torch.ones(3, SMALL.memory), done)
+    whole = network(told, torch.ones(3, SMALL.memory), done)
     hidden = torch.ones(3, SMALL.memory)
     for step, sight in enumerate(steps):
         _, decision = network.act(sight, hidden)
@@ -130,11 +128,12 @@ def test_a_scene_moved_with_the_belief_looks_the_same():
     moved = dataclasses.replace(
         sight, camera=sight.camera + shift, hand=sight.hand + shift, belief=belief
     )
-    seen = network.look(sight).features[:, : network.pooled]
-    again = network.look(moved).features[:, : network.pooled]
-    torch.testing.assert_close(again, seen, atol=2e-3, rtol=0.0)
-    aside = network.look(dataclasses.replace(sight, belief=belief))
-    assert (aside.features[:, : network.pooled] - seen).abs().max() > 0.05
+    seen = network.look(sight).flow
+    again = network.look(moved).flow
+    torch.testing.assert_close(again.shift, seen.shift, atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(again.log_scale, seen.log_scale, atol=2e-3, rtol=0.0)
+    aside = network.look(dataclasses.replace(sight, belief=belief)).flow
+    assert (aside.log_scale - seen.log_scale).abs().max() > 0.01
 
 
 def test_it_reads_nothing_out_of_reach():
@@ -146,7 +145,7 @@ def test_it_reads_nothing_out_of_reach():
         points = sight.belief.position[:, None] + step * (far - sight.belief.position[:, None])
         camera = torch.cat([sight.camera, points], dim=1)
         found = network.look(dataclasses.replace(sight, camera=camera))
-        assert torch.allclose(found.features, read.features, atol=1e-6) != seen
+        assert torch.allclose(found.told, read.told, atol=1e-6) != seen
         assert (found.voxels == read.voxels + seen).all()
 
 

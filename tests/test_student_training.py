@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.policy_runner import CameraRunner, Sensed
@@ -18,16 +19,18 @@ from vd.policy.bundle import read_policy, write_policy
 from vd.train.checkpoint import list_checkpoints
 from vd.train.student import made
 from vd.train.student.build import build_student
-from vd.train.student.config import StudentTrainCfg, smoke
+from vd.train.student.config import SimulatedCfg, StudentTrainCfg, smoke
 from vd.train.student.sequences import Sequences, acting_losses, belief_errors, flow_loss
+from vd.train.student.simulated import BeliefErrors
 from vd.vision.acting import StudentPolicy
 from vd.vision.cfg import StudentCfg
 from vd.vision.inputs import Belief, carried
+from vd.vision.rotations import quaternion_matrices, random_rotations
 from vd.vision.student import Decision, rigid_motion
 
-TINY = StudentCfg(
-    channels=(8, 16), blocks=1, embedding=32, flow=32, senses=16, memory=32, head=32, voxel_m=0.01
-)
+CPU = torch.device("cpu")
+
+TINY = StudentCfg(channels=(8, 16), blocks=1, flow=32, senses=16, memory=32, head=32, voxel_m=0.01)
 
 
 def settings(stage: int, out: Path, **learn) -> StudentTrainCfg:
@@ -94,7 +97,7 @@ def test_seeing_and_acting_learn_by_themselves(tmp_path):
     assert eyes == {"stages", "flow"}
     trainer.act(next(trainer.source.sequences()), 0.0)
     rest = changed() - eyes
-    assert rest == {"project", "senses", "memory", "head", "action", "log_distance"}
+    assert rest == {"senses", "memory", "head", "action", "log_distance"}
     trainer.close()
 
 
@@ -110,11 +113,11 @@ def test_a_sequence_is_what_was_done(stage, tmp_path):
     said = []
     decide = acting.decide
 
-    def heard(sight):
-        look, decision = decide(sight)
-        told.append(look.features)
-        said.append(acting.build.frames.joints_in(decision.action, sight.frame))
-        return look, decision
+    def heard(numbers, frame):
+        decision = decide(numbers, frame)
+        told.append(numbers)
+        said.append(acting.build.frames.joints_in(decision.action, frame))
+        return decision
 
     acting.decide = heard
     env = trainer.source.env
@@ -122,10 +125,10 @@ def test_a_sequence_is_what_was_done(stage, tmp_path):
     assert trainer.source.collect(acting, lambda: False)
     sequences = next(trainer.source.sequences())
     assert sequences.done.any()
-    same = (sequences.features[:, :, None] == torch.stack(told)[:, None]).all(dim=-1).all(dim=0)
+    same = (sequences.told[:, :, None] == torch.stack(told)[:, None]).all(dim=-1).all(dim=0)
     assert (same.sum(dim=1) == 1).all()
     rows = same.int().argmax(dim=1)
-    decision = trainer.network(sequences.features, sequences.hidden, sequences.done)
+    decision = trainer.network(sequences.told, sequences.hidden, sequences.done)
     torch.testing.assert_close(decision.action, torch.stack(said)[:, rows], atol=1e-5, rtol=1e-4)
     assert float(sequences.label.abs().max()) <= 1.0
     trainer.close()
@@ -155,6 +158,27 @@ def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
     assert turn.mean() == pytest.approx(0.5 * made.AWAY_RAD, abs=0.2)  # four deviations
     assert shift.max() < np.sqrt(3.0) * made.AWAY_M + 1e-6
     trainer.close()
+
+
+def test_errors_of_beliefs_are_as_large_and_last_as_they_are_said_to():
+    torch.manual_seed(0)
+    envs = 4000
+    errors = BeliefErrors(envs, SimulatedCfg(belief_rad=0.2, belief_m=0.004), CPU)
+    truth = Belief(quaternion_matrices(random_rotations(envs, CPU)), torch.randn(envs, 3))
+    fresh = torch.zeros(envs, dtype=torch.bool)
+    fresh[:2000] = True
+    steps = []
+    for step in range(2):
+        belief = errors.about(truth, fresh & (step > 0))
+        turn = belief.rotation @ truth.rotation.mT
+        axis = Rotation.from_matrix(turn.numpy()).as_rotvec()
+        steps.append(np.hstack([axis / 0.2, (belief.position - truth.position) / 0.004]))
+    first, later = steps
+    # Normal, with a deviation that is uniform in [0, 1] for each environment.
+    assert later.std(axis=0) == pytest.approx(np.full(6, np.sqrt(1.0 / 3.0)), abs=0.04)
+    together = (first * later).mean(axis=1)
+    assert together[:2000].mean() == pytest.approx(0.0, abs=0.02)
+    assert together[2000:].mean() == pytest.approx(0.9 / 3.0, abs=0.04)
 
 
 def test_losses_are_least_at_the_truth(tmp_path):

@@ -14,10 +14,12 @@ from vd.assets_usd.hands import load_hand
 from vd.evaluate.scanned import MISSING
 from vd.train.student.shapes import made_shapes
 from vd.train.student.views import (
+    POINT_STD_M,
     TOUCH_M,
     Hands,
     draw_pairs,
     goal_points,
+    own_points,
     posture_points,
     visible,
 )
@@ -85,7 +87,7 @@ def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand, camera
     points = one.box[0] - 0.05 + (one.box[1] - one.box[0] + 0.1) * torch.rand(1, 1500, 3)
     row = torch.zeros(1, dtype=torch.long)
     cell, depth = one.project(row, points)
-    free = one.free(row, points, cell, depth)[0].numpy()
+    free = (one.before(row, cell, depth) & ~one.near(row, points))[0].numpy()
     eye = one.eye[0].double().numpy()
     optical = Rotation.from_matrix(one._optical[0].numpy()).inv()
     moved = np.abs(eye - hand.camera.position).max()
@@ -104,6 +106,31 @@ def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand, camera
     assert free[clear & (apart > 2 * TOUCH_M)].all()
     touching = one._near[0, one._voxel(torch.tensor(own[None], dtype=torch.float32))[0]]
     assert touching.float().mean() > 0.5  # the rest lies outside of where objects are
+
+
+def test_of_a_hand_a_camera_has_what_neither_it_nor_an_object_hides(hand):
+    """Against a search through all points, angle by angle."""
+    torch.manual_seed(5)
+    one = Hands(hand, 1, device="cpu")
+    own = posture_points(hand, one.joints)
+    middle = one.box.mean(dim=0)
+    ball = middle + 0.04 * torch.nn.functional.normalize(torch.randn(1, 4000, 3), dim=-1)
+    seen = own_points(one, torch.zeros(1, dtype=torch.long), ball, own)[0].numpy()
+    shown = np.isfinite(seen).all(axis=1)
+    assert np.abs(seen - own[0].numpy())[shown].max() < 6 * POINT_STD_M
+    optical = Rotation.from_matrix(one._optical[0].numpy()).inv()
+    there = optical.apply(own[0].double().numpy() - one.eye[0].double().numpy())
+    blocks = np.vstack([there, optical.apply(ball[0].double().numpy() - one.eye[0].numpy())])
+    place, others = (x[:, :2] / x[:, 2:] for x in (there, blocks))
+    across = np.linalg.norm(place[::7, None] - others[None], axis=-1)
+    behind = there[::7, None, 2] - blocks[None, :, 2]
+    width = float(one._cell[0])
+    hidden = ((behind > 0.025) & (across < 0.3 * width)).any(axis=1)
+    clear = ~((behind > 0.006) & (across < 1.5 * width)).any(axis=1)
+    assert hidden.sum() > 50 and clear.sum() > 50
+    inside = one.project(torch.zeros(1, dtype=torch.long), own)[0][0].numpy()[::7] < one.cells - 1
+    assert not shown[::7][hidden & inside].any()
+    assert shown[::7][clear].all()
 
 
 def test_a_camera_elsewhere_sees_another_side(hand, monkeypatch):

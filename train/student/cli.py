@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 STAGES = """Train the student: a network that acts on what a camera sees, and remembers.
 
 Stage 0 learns where objects are, from clouds that are made; stage 1 learns to act from a teacher, in
-simulation with complete clouds; stage 2 by a depth camera with its errors."""
+simulation, by beliefs that are drawn, and to see complete clouds; stage 2 by a depth camera with its
+errors."""
 
 
 def _as_in(base: StudentTrainCfg, init: str) -> StudentTrainCfg:

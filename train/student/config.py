@@ -87,6 +87,12 @@ class SimulatedCfg:
 
     epochs: int = 4
     """Passes over what was done in an iteration."""
+    looks: int = 1024
+    """Looks of an iteration to learn to see from, of steps and environments at random."""
+    belief_rad: float = 0.2
+    """Stage 1: deviation of what is believed of rotations about each axis, at most [rad]."""
+    belief_m: float = 0.004
+    """Stage 1: deviation of what is believed of places along each axis, at most [m]."""
     blank_probability: float = 0.02
     """Stage 2: chance in a step that the camera goes blank for a while."""
     blank_steps: int = 8
@@ -96,7 +102,8 @@ class SimulatedCfg:
 
     def validate(self) -> None:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
-        require(self, "--simulated.", "positive", "epochs blank_steps")
+        require(self, "--simulated.", "positive", "epochs looks blank_steps")
+        require(self, "--simulated.", "zero or positive", "belief_rad belief_m")
         require(self, "--simulated.", "in [0, 1]", "blank_probability")
 
 
@@ -108,8 +115,8 @@ class StudentTrainCfg:
     """Settings to start from; every other flag overrides one of them. By default gpu, and cpu-demo
     where there is none."""
     stage: Stage = MADE
-    """0: learn where objects are, from clouds that are made; 1: learn to act from a teacher, on
-    complete clouds in simulation; 2: the same by a depth camera."""
+    """0: learn where objects are, from clouds that are made; 1: learn to act from a teacher in
+    simulation, by beliefs that are drawn, and to see complete clouds; 2: both by a depth camera."""
     teacher: str | None = None
     """Policy that labels, also the source of hand and task: a policy.safetensors, a run's folder, or
     the name of an installed one; dclaw4 by default."""
@@ -152,7 +159,7 @@ def gpu(stage: Stage) -> StudentTrainCfg:
         stage=stage,
         run=RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000),
         learn=LearnCfg(precision="bf16"),
-        task=StageTaskCfg(num_envs=1024 if stage == RENDERED else 4096),
+        task=StageTaskCfg(num_envs=1024 if stage == RENDERED else 16384),
     )
 
 
@@ -172,7 +179,6 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         student=StudentCfg(
             channels=(16, 32, 64),
             blocks=1,
-            embedding=64,
             flow=64,
             senses=64,
             memory=64,
@@ -186,6 +192,7 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             warmup_steps=20,
         ),
         clouds=CloudsCfg(shapes=64, hands=32, updates=10, validate_every=10),
+        simulated=SimulatedCfg(looks=16),
         task=StageTaskCfg(num_envs=16),
     )
 

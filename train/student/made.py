@@ -16,7 +16,7 @@ from vd.train.student.bank import ShapeBank, centred_points
 from vd.train.student.config import StudentTrainCfg
 from vd.train.student.sequences import Looks, Sequences, belief_errors
 from vd.train.student.shapes import random_matrices, uniform
-from vd.train.student.views import Hands, camera_points, goal_points, posed
+from vd.train.student.views import Hands, camera_points, goal_points, own_points, posed
 from vd.vision.acting import PASSES, ActingStudent
 from vd.vision.inputs import Belief, carried
 from vd.vision.rotations import matrices_about
@@ -106,12 +106,13 @@ class MadeSequences:
         middle = carried(goal.mean(dim=1, keepdim=True), rotation)[:, 0]
         truth = Belief(rotation, position + middle)
         joint_q = self._hands.joints[posture]
+        surfaces = placed[:, self._clouds.points :]
         senses = Senses(
             joint_q=joint_q,
             joint_qd=torch.randn_like(joint_q),
             action=uniform(-1.0, 1.0, *joint_q.shape, device=device),
             goal_quat=acting.build.goal_quat(random_matrices(count, device)),
-            points=self._seen(placed[:, self._clouds.points :], posture),
+            points=self._seen(surfaces, posture, acting.build.hand_points(joint_q)),
             fresh=torch.zeros(count, dtype=torch.bool, device=device),
         )
         sight = acting.build(senses, off(truth))
@@ -147,11 +148,20 @@ class MadeSequences:
     def close(self) -> None:
         """Nothing."""
 
-    def _seen(self, surfaces: Tensor, posture: Tensor) -> Tensor:
-        """Points that a camera sees of surfaces [B, P, 6], or of the whole of them [B, K, 3]."""
+    def _seen(self, surfaces: Tensor, posture: Tensor, hand: Tensor) -> Tensor:
+        """Points that a camera sees of surfaces [B, P, 6] and hands [B, H, 3], or whole surfaces.
+
+        NaN for what is not seen [B, K + H, 3].
+        """
         wanted = self._clouds.points
-        seen = camera_points(self._hands, posture, surfaces, wanted)
+        seen = camera_points(self._hands, posture, surfaces, wanted, apart=False)
+        own = own_points(self._hands, posture, surfaces[..., :3], hand)
         whole = surfaces[:, :wanted, :3]
         whole = whole + self._clouds.noise_m * torch.randn_like(whole)
+        nothing = torch.full_like(own, torch.nan)
         by_camera = torch.rand((len(surfaces), 1, 1), device=surfaces.device)
-        return torch.where(by_camera < self._clouds.seen_share, seen, whole)
+        return torch.where(
+            by_camera < self._clouds.seen_share,
+            torch.cat([seen, own], dim=1),
+            torch.cat([whole, nothing], dim=1),
+        )

@@ -32,8 +32,8 @@ class Looks:
 class Sequences:
     """Sequences to learn to act from."""
 
-    features: Tensor
-    """What was told of the look of each step [T, B, S]."""
+    told: Tensor
+    """What was told in each step [T, B, S]."""
     hidden: Tensor
     """Memory before the first step [B, G]."""
     done: Tensor

@@ -1,13 +1,14 @@
 """Stages 1 and 2: the student acts in simulation, and the teacher says what it would have done (DAgger).
 
-Where an episode begins the student is told about where the object is, and follows it from there. In
-stage 1 it is told complete surfaces where the objects truly are, and nothing is rendered; in stage
-2 what a depth camera sees. Rollouts hold what clouds are made of rather than clouds (0.4 kB a step;
-with a camera also its points). T steps, N environments, D joints, K points.
+In stage 1 nothing is rendered: where objects are believed to be is drawn about the truth, so to act
+costs hardly more than the simulation; to see is learned from complete clouds, of some of the steps.
+In stage 2 the student sees by a depth camera. Where an episode begins it is told about where the
+object is, and follows it from there. T steps, N environments, D joints, K points.
 """
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from operator import itemgetter
 from typing import Any
 
@@ -22,14 +23,48 @@ from vd.policy.actor import TrainedPolicy
 from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
 from vd.train.metrics import GoalWindow, StepMeans
-from vd.train.student.config import StudentTrainCfg
+from vd.train.student.config import SimulatedCfg, StudentTrainCfg
 from vd.train.student.made import off
 from vd.train.student.sequences import Looks, Sequences, belief_errors
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
-from vd.vision.inputs import carried, each, joined
-from vd.vision.rotations import quaternion_matrices, turn_angle
+from vd.vision.inputs import Belief, StudentInput, carried, each, joined
+from vd.vision.rotations import matrices_about, quaternion_matrices, turn_angle
+
+KEPT = 0.9
+"""Of an error of a belief, in the next step (ours): they last most of a second. Not tuned."""
+
+
+class BeliefErrors:
+    """Errors of what is believed, drawn so that they last as those of looks do.
+
+    Args:
+        envs: N.
+        cfg: How large they are at most.
+        device: Torch device.
+
+    Attributes:
+        state: Errors of rotations and places in their deviations, and these as shares of the
+            largest [N, 7].
+    """
+
+    def __init__(self, envs: int, cfg: SimulatedCfg, device: torch.device):
+        self._cfg = cfg
+        self.state = torch.randn((envs, 7), device=device)
+        self.state[:, 6].uniform_()
+
+    def about(self, truth: Belief, fresh: Tensor) -> Belief:
+        """Beliefs of the next step, for true ones; where an episode begins, bool [N], others begin."""
+        drawn = torch.randn_like(self.state)
+        later = KEPT * self.state + math.sqrt(1.0 - KEPT**2) * drawn
+        later[:, 6] = self.state[:, 6]
+        drawn[:, 6].uniform_()
+        self.state = torch.where(fresh[:, None], drawn, later)
+        turn = self._cfg.belief_rad * self.state[:, 6:] * self.state[:, :3]
+        shift = self._cfg.belief_m * self.state[:, 6:] * self.state[:, 3:6]
+        rotation = matrices_about(turn, turn.norm(dim=1)) @ truth.rotation
+        return Belief(rotation, truth.position + shift)
 
 
 class SimulatedSequences:
@@ -76,6 +111,7 @@ class SimulatedSequences:
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
+        self._errors = BeliefErrors(env.num_envs, cfg.simulated, place)
         self._looks: Looks
         self._done: Sequences
         self._means = StepMeans()
@@ -86,28 +122,25 @@ class SimulatedSequences:
     def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> bool:
         """Act for T steps; false if it was cut short."""
         window = self._cfg.learn.window
-        build = acting.build
-        learned = torch.randint_like(self.blank, window)  # of each environment one look
         looks = []
         steps = []
         hidden = acting.hidden
-        for step in range(window):
+        for _ in range(window):
             if stopping():
                 self._means.clear()
                 return False
             pose = poses_in(self._base, self._pose)
-            place = build.belief_of(pose)
+            place = acting.build.belief_of(pose)
             senses = self.senses(pose)
-            sight = acting.look(senses, off(place))
-            truth = build.frames.belief_in(place, sight.frame)
-            look, decision = acting.decide(sight)
+            sight, told, belief = self._sighted(acting, senses, place)
+            truth = acting.build.frames.belief_in(place, sight.frame)
+            looks.append(self._learned(sight, truth))
+            decision = acting.decide(told, sight.frame)
             label = self.labels()
+            named = acting.build.frames.joints_in(label, sight.frame)
             distance = turn_angle(truth.rotation.mT @ sight.goal_rotation)
-            named = build.frames.joints_in(label, sight.frame)
-            steps.append((look.features, named, distance, senses.fresh))
-            rows = (learned == step).nonzero()[:, 0]
-            looks.append(Looks(each(sight, itemgetter(rows)), each(truth, itemgetter(rows))))
-            turn, shift = belief_errors(look.belief, truth)
+            steps.append((told, named, distance, senses.fresh))
+            turn, shift = belief_errors(belief, truth)
             wrong = (decision.action - label).abs()
             _, _, _, extras = self.env.step(decision.action)
             self._choose_frames()
@@ -122,9 +155,9 @@ class SimulatedSequences:
         self.env.env.check()
         sights = joined([look.sight for look in looks])
         self._looks = Looks(sights, joined([look.truth for look in looks]))
-        features, labels, distances, fresh = map(torch.stack, zip(*steps, strict=True))
+        told, labels, distances, fresh = map(torch.stack, zip(*steps, strict=True))
         self._done = Sequences(
-            features=features,
+            told=told,
             hidden=hidden.masked_fill(fresh[0, :, None], 0.0),
             done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
             label=labels,
@@ -132,9 +165,35 @@ class SimulatedSequences:
         )
         return True
 
+    def _sighted(
+        self, acting: ActingStudent, senses: Senses, place: Belief
+    ) -> tuple[StudentInput, Tensor, Belief]:
+        """What there is to read, what is told, and where the objects are believed to be, in frames.
+
+        Without a camera that is drawn about their true places (base frame); with one it is seen.
+        """
+        if self._camera is None:
+            acting.forget(senses.fresh)
+            sight = acting.build(senses, self._errors.about(place, senses.fresh))
+            return sight, acting.network.told(sight, sight.belief), sight.belief
+        sight = acting.look(senses, off(place))
+        look = acting.see(sight)
+        return sight, look.told, look.belief
+
+    def _learned(self, sight: StudentInput, truth: Belief) -> Looks:
+        """Looks of a step to learn to see from, of environments at random."""
+        rows = torch.randperm(len(truth.position), device=self.blank.device)
+        taken = itemgetter(rows[: math.ceil(self._cfg.simulated.looks / self._cfg.learn.window)])
+        shown = each(sight, taken)
+        actual = each(truth, taken)
+        if self._camera is None:
+            shown = replace(shown, belief=off(actual))
+        return Looks(shown, actual)
+
     def looks(self, acting: ActingStudent) -> Iterator[Looks]:
-        """A look of each environment."""
-        order = torch.randperm(self.env.num_envs, device=self.blank.device)
+        """Looks of all steps, in an order at random."""
+        count = len(self._looks.truth.position)
+        order = torch.randperm(count, device=self.blank.device)
         for rows in order.split(self._cfg.learn.batch):
             taken = itemgetter(rows)
             yield Looks(each(self._looks.sight, taken), each(self._looks.truth, taken))
@@ -146,7 +205,7 @@ class SimulatedSequences:
             order = torch.randperm(self.env.num_envs, device=self.blank.device)
             for rows in order.split(self._cfg.learn.sequences):
                 yield Sequences(
-                    features=done.features[:, rows],
+                    told=done.told[:, rows],
                     hidden=done.hidden[rows],
                     done=done.done[:, rows],
                     label=done.label[:, rows],
@@ -201,6 +260,7 @@ class SimulatedSequences:
         camera = {} if self._camera is None else self._camera.stateful()
         return {
             "blank": self.blank,
+            "errors": self._errors.state,
             "window": self._window.state_dict(),
             "camera": {name: array.numpy() for name, array in camera.items()},
         }
@@ -208,6 +268,7 @@ class SimulatedSequences:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
         self.blank.copy_(state["blank"])
+        self._errors.state.copy_(state["errors"])
         self._window.load_state_dict(state["window"])
         if self._camera is not None:
             for name, array in self._camera.stateful().items():

@@ -109,7 +109,7 @@ class StudentTrainer(SupervisedLoop):
     def act(self, sequences: Sequences, done: float) -> dict[str, Tensor]:
         """One optimiser step of what acts; its losses."""
         self.network.train()
-        decision = self.network(sequences.features, sequences.hidden, sequences.done)
+        decision = self.network(sequences.told, sequences.hidden, sequences.done)
         losses = acting_losses(decision, sequences, self.cfg.learn)
         return self._descend(losses, done, self._acting)
 

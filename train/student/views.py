@@ -162,11 +162,13 @@ class Hands:
         """Points [.., 3] in the optical frames of hands ``rows`` [B]: [B, P, 3] [m]."""
         return (points - self.eye[rows, None]) @ self._optical[rows]
 
-    def free(self, rows: Tensor, points: Tensor, cell: Tensor, depth: Tensor) -> Tensor:
-        """Which points [B, P, 3] are neither behind nor beside the hands ``rows`` [B]; [B, P]."""
-        hand = rows[:, None]
-        before = depth < self._depth[hand, cell]
-        return before & ~self._near[hand, self._voxel(points)]
+    def before(self, rows: Tensor, cell: Tensor, depth: Tensor) -> Tensor:
+        """Which points in cells at depths [m] [B, P] are not behind the hands ``rows`` [B]."""
+        return depth < self._depth[rows[:, None], cell]
+
+    def near(self, rows: Tensor, points: Tensor) -> Tensor:
+        """Which points [B, P, 3] are beside the hands ``rows`` [B]; [B, P]."""
+        return self._near[rows[:, None], self._voxel(points)]
 
     def holding(self, points: Tensor) -> Tensor:
         """For shapes with points [B, P, 3] hands that are about them, at random [B]."""
@@ -215,13 +217,14 @@ def nearest(cell: Tensor, depth: Tensor, cells: int) -> Tensor:
     return empty.scatter_reduce_(1, cell, depth, "amin")
 
 
-def visible(hands: Hands, rows: Tensor, shapes: Tensor) -> Tensor:
-    """Which points a camera sees and tells from the hand [B, P].
+def visible(hands: Hands, rows: Tensor, shapes: Tensor, *, apart: bool = True) -> Tensor:
+    """Which points a camera sees [B, P].
 
     Args:
         hands: The hands.
         rows: Which of them holds each shape [B].
         shapes: Points [m] and normals [B, P, 6].
+        apart: Only those that are told from the hand by where they are.
     """
     points = shapes[..., :3]
     ray = hands.rays(rows, points)
@@ -229,12 +232,34 @@ def visible(hands: Hands, rows: Tensor, shapes: Tensor) -> Tensor:
     cell, depth = hands.project(rows, points)
     front = torch.where(facing, depth, torch.inf)
     shown = facing & (depth < nearest(cell, front, hands.cells).gather(1, cell) + SLACK_M)
-    free = shown & hands.free(rows, points, cell, depth)
+    free = shown & hands.before(rows, cell, depth)
+    if apart:
+        free = free & ~hands.near(rows, points)
     enough = free.sum(dim=1, keepdim=True) >= LEAST_SEEN
     return torch.where(enough, free, facing)
 
 
-def camera_points(hands: Hands, rows: Tensor, shapes: Tensor, count: int) -> Tensor:
+def own_points(hands: Hands, rows: Tensor, shapes: Tensor, points: Tensor) -> Tensor:
+    """Points [m] [B, H, 3] that a camera has of the hands themselves, NaN for those that are hidden.
+
+    Args:
+        hands: The hands.
+        rows: Which of them holds each shape [B].
+        shapes: Points [m] of shapes, which hide hands [B, P, 3].
+        points: Of these hands [m] [B, H, 3].
+    """
+    cell, depth = hands.project(rows, points)
+    shape_cell, shape_depth = hands.project(rows, shapes)
+    shape = nearest(shape_cell, shape_depth, hands.cells).gather(1, cell)
+    front = depth - SLACK_M
+    shown = hands.before(rows, cell, front) & (front < shape)
+    noisy = points + POINT_STD_M * torch.randn_like(points)
+    return noisy.masked_fill(~shown[..., None], torch.nan)
+
+
+def camera_points(
+    hands: Hands, rows: Tensor, shapes: Tensor, count: int, *, apart: bool = True
+) -> Tensor:
     """Points [m] [B, count, 3] that a camera has of shapes, with errors.
 
     Arguments as of :func:`visible`.
@@ -242,7 +267,7 @@ def camera_points(hands: Hands, rows: Tensor, shapes: Tensor, count: int) -> Ten
     points = shapes[..., :3]
     device = shapes.device
     batch = len(points)
-    shown = visible(hands, rows, shapes)
+    shown = visible(hands, rows, shapes, apart=apart)
     patches = drawn(shown.float(), LOST_PATCHES)
     kept = shown
     for middle in points.take_along_dim(patches[..., None], dim=1).unbind(1):

@@ -79,6 +79,10 @@ class ActingStudent:
         """Where the objects' frames are believed to be, base frame [N, 7]."""
         return self.build.pose_of(self.belief)
 
+    def forget(self, fresh: Tensor) -> None:
+        """Remember nothing where an episode begins, bool [N]."""
+        self.hidden = self.hidden.masked_fill(fresh[:, None], 0.0)
+
     def look(self, senses: Senses, begin: Belief | None = None) -> StudentInput:
         """What the network reads.
 
@@ -86,7 +90,7 @@ class ActingStudent:
             senses: What was sensed.
             begin: What is believed where an episode begins [N]; None: the object is looked for.
         """
-        self.hidden = self.hidden.masked_fill(senses.fresh[:, None], 0.0)
+        self.forget(senses.fresh)
         self.lost = self.lost | senses.fresh
         first = self.build.first_belief(senses.goal_quat) if begin is None else begin
         lost = self.lost[:, None]
@@ -125,21 +129,29 @@ class ActingStudent:
             self.belief.rotation[some] = belief.rotation[chosen]
             self.belief.position[some] = belief.position[chosen]
 
-    def decide(self, sight: StudentInput) -> tuple[Look, Decision]:
-        """What the network sees, and decides in the order of the joints, which is remembered."""
-        look, decision = self.network.act(sight, self.hidden)
-        frames = self.build.frames
-        belief = frames.belief_out(look.belief, sight.frame)
+    def see(self, sight: StudentInput) -> Look:
+        """What the network sees; where the object then is believed to be is kept."""
+        look = self.network.look(sight)
+        belief = self.build.frames.belief_out(look.belief, sight.frame)
         # One that strayed would have nothing in sight to come back by.
         self.belief = self.build.near_place(belief, self.network.cfg.reach_m)
+        return look
+
+    def decide(self, told: Tensor, frame: Tensor) -> Decision:
+        """What the network decides by what it is told in frames, in the order of the joints.
+
+        It is remembered.
+        """
+        decision = self.network.decide(told, self.hidden)
         self.hidden = decision.hidden
-        action = frames.joints_out(decision.action, sight.frame)
-        return look, replace(decision, action=action)
+        return replace(decision, action=self.build.frames.joints_out(decision.action, frame))
 
     @torch.no_grad()
     def step(self, senses: Senses) -> CameraDecision:
         """One control step."""
-        look, decision = self.decide(self.look(senses))
+        sight = self.look(senses)
+        look = self.see(sight)
+        decision = self.decide(look.told, sight.frame)
         pose = self.pose
         turn = self._base[:, 3:]
         return CameraDecision(

@@ -47,8 +47,6 @@ class StudentCfg:
     """Width of each stage; each halves the grid."""
     blocks: int = 1
     """Residual blocks of a stage."""
-    embedding: int = 256
-    """Width of what one look shows."""
     flow: int = 256
     """Width of the layers that predict by how much the goal's voxels are to move."""
     senses: int = 256
@@ -72,6 +70,6 @@ class StudentCfg:
         for name in ("voxel_m", "reach_m"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"student.{name} = {getattr(self, name)} must be positive")
-        for name in ("embedding", "flow", "senses", "memory", "head"):
+        for name in ("flow", "senses", "memory", "head"):
             if getattr(self, name) < 1:
                 raise ValueError(f"student.{name} must be positive")

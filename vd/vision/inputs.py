@@ -237,9 +237,7 @@ class InputBuilder:
             rows: Environment of each row [R]; row i is of environment i by default.
         """
         joint_q = senses.joint_q
-        poses = joint_q.new_empty((len(joint_q), self._links, 7))
-        links = as_warp(poses, wp.transform)
-        self._cloud.pose(as_warp(joint_q), links)
+        poses = self._link_poses(joint_q)
         goal_rotation = self.goal_rotation(senses.goal_quat)
         frame = self.frames.choose(belief, goal_rotation)
         turn = self.frames.turn[frame]
@@ -249,7 +247,7 @@ class InputBuilder:
         named = self.frames.joints_in(joints, frame)[..., self._moved]
         return StudentInput(
             camera=carried(senses.points, turn),
-            hand=carried(wp.to_torch(self._cloud(links)), turn),
+            hand=carried(self._points_on(poses), turn),
             goal=self._goals if rows is None else self._goals[rows],
             goal_rotation=turn @ goal_rotation,
             proprioception=named.flatten(1),
@@ -257,6 +255,20 @@ class InputBuilder:
             belief=self.frames.belief_in(belief, frame),
             frame=frame,
         )
+
+    def hand_points(self, joint_q: Tensor) -> Tensor:
+        """The hand's own points [m] [R, H, 3] by positions of its joints [rad] [R, D]."""
+        return self._points_on(self._link_poses(joint_q))
+
+    def _link_poses(self, joint_q: Tensor) -> Tensor:
+        """Poses of the links in the world [R, L, 7]."""
+        poses = joint_q.new_empty((len(joint_q), self._links, 7))
+        self._cloud.pose(as_warp(joint_q), as_warp(poses, wp.transform))
+        return poses
+
+    def _points_on(self, poses: Tensor) -> Tensor:
+        """The hand's own points [m] [R, H, 3] for poses of its links in the world [R, L, 7]."""
+        return wp.to_torch(self._cloud(as_warp(poses, wp.transform)))
 
     def _tips(self, poses: Tensor) -> Tensor:
         """Places of the fingertips [R, G, 3], of poses of the links in the world [R, L, 7]."""

@@ -6,15 +6,15 @@ be, so what is wrong with the belief shows as a shift between two surfaces, wher
 The network predicts for each voxel of the goal by how much it is to move, and how sure that is; the
 rigid motion that fits these shifts best makes the belief better.
 
-What it then believes is told its memory and its head as numbers, beside what its convolutions saw:
-how far the fingertips are from the goal's cloud laid there, how far that extends, and the wanted
-rotation. A GRU carries over steps what one look does not show.
+What it then believes is told its memory and its head as numbers: how far the fingertips are from
+the goal's cloud laid there, how far that extends, and the wanted rotation. A GRU carries over steps
+what one look does not show.
 
-Seeing learns from single looks and acting from sequences of what was seen: no gradient flows from
+Seeing learns from single looks and acting from sequences of what was told: no gradient flows from
 one to the other. So to learn to act is cheap, and each gets as many optimiser steps as it needs.
 
-N environments, T steps, R looks, V voxels of goals in all of them, A actions, F fingertips, E the
-embedding, G the memory. The frames of :mod:`vd.vision.inputs`; metres, radians.
+N environments, T steps, R looks, V voxels of goals in all of them, A actions, F fingertips, S told
+numbers, G the memory. The frames of :mod:`vd.vision.inputs`; metres, radians.
 """
 
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ class Flow:
 class Look:
     """What R looks show, without memory."""
 
-    features: Tensor
+    told: Tensor
     """What is told of it, through which no gradient flows [R, S]."""
     belief: Belief
     """The better belief [R]."""
@@ -171,13 +171,9 @@ class Student(nn.Module):
         self.stages = nn.Sequential()
         for inputs, outputs in pairwise(widths):
             self.stages.append(VoxelStage(inputs, outputs, cfg.blocks))
-        self.pooled = 2 * widths[-1]
-        self.project = nn.Sequential(
-            nn.Linear(self.pooled, cfg.embedding),
-            nn.LayerNorm(cfg.embedding),
-        )
+        pooled = 2 * widths[-1]
         self.flow = nn.Sequential(
-            nn.Linear(sum(widths[1:]) + self.pooled + 6, cfg.flow),
+            nn.Linear(sum(widths[1:]) + pooled + 6, cfg.flow),
             nn.GELU(),
             nn.Linear(cfg.flow, cfg.flow),
             nn.GELU(),
@@ -185,14 +181,14 @@ class Student(nn.Module):
         )
         ways = torch.tensor(DIRECTIONS)
         self.register_buffer("directions", normalize(ways, dim=1), persistent=False)
-        told = 3 * num_actions + BELIEVED + 1 + 3 * num_tips + 2 * len(ways)
+        told = 3 * num_actions + BELIEVED + 3 * num_tips + 2 * len(ways)
         self.senses = nn.Sequential(
             nn.Linear(told, cfg.senses),
             nn.GELU(),
             nn.Linear(cfg.senses, cfg.senses),
             nn.LayerNorm(cfg.senses),
         )
-        self.memory = nn.GRU(cfg.embedding + cfg.senses, cfg.memory)
+        self.memory = nn.GRU(cfg.senses, cfg.memory)
         self.head = nn.Sequential(
             nn.Linear(cfg.memory + cfg.senses, cfg.head),
             nn.GELU(),
@@ -234,8 +230,7 @@ class Student(nn.Module):
         )
         of_look = torch.bincount(flow.look, minlength=looks)
         doubt = torch.segment_reduce(flow.log_scale, "mean", lengths=of_look, unsafe=True)
-        features = torch.cat([pooled, doubt[:, None], self._told(sight, better)], dim=1)
-        return Look(features.detach(), better, doubt, seen, flow)
+        return Look(self.told(sight, better).detach(), better, doubt, seen, flow)
 
     def _convolve(self, voxels: SparseTensor) -> list[SparseTensor]:
         """Features of the cells of each stage."""
@@ -271,34 +266,36 @@ class Student(nn.Module):
             look=look,
         )
 
-    def forward(self, features: Tensor, hidden: Tensor, done: Tensor | None = None) -> Decision:
+    def forward(self, told: Tensor, hidden: Tensor, done: Tensor | None = None) -> Decision:
         """Decide in a sequence of steps.
 
         Args:
-            features: What was told of the look of each step [T, N, S].
+            told: What was told in each step [T, N, S].
             hidden: Memory before the first step [N, G].
             done: Where step t was the last of an episode, bool [T, N]: t + 1 begins without memory.
         """
-        seen, told = features.split([self.pooled, features.shape[-1] - self.pooled], dim=-1)
         sensed = self.senses(told)
-        inputs = torch.cat([self.project(seen), sensed], dim=-1)
-        remembered, hidden = self._remember(inputs, hidden, done)
+        remembered, hidden = self._remember(sensed, hidden, done)
         decided = self.head(torch.cat([remembered, sensed], dim=-1))
         return Decision(self.action(decided), self.log_distance(decided).squeeze(-1), hidden)
+
+    def decide(self, told: Tensor, hidden: Tensor) -> Decision:
+        """Decide in one step of N hands, leading axes [N]."""
+        step = self(told[None], hidden)
+        return Decision(step.action[0], step.log_distance[0], step.hidden)
 
     def act(self, sight: StudentInput, hidden: Tensor) -> tuple[Look, Decision]:
         """Look, and decide: one step of N hands, leading axes [N]."""
         look = self.look(sight)
-        step = self(look.features[None], hidden)
-        return look, Decision(step.action[0], step.log_distance[0], step.hidden)
+        return look, self.decide(look.told, hidden)
 
     def _within_reach(self, points: Tensor) -> Tensor:
         """Points [.., 3] about the object's place; NaN for those that are out of reach."""
         far = points.norm(dim=-1, keepdim=True) > self.cfg.reach_m
         return points.masked_fill(far, torch.nan)
 
-    def _told(self, sight: StudentInput, belief: Belief) -> Tensor:
-        """What is told beside what convolutions saw [R, 3 A + 9 + 3 F + 52].
+    def told(self, sight: StudentInput, belief: Belief) -> Tensor:
+        """What memory and head are told where an object is believed to be [R, 3 A + 9 + 3 F + 52].
 
         Joints and the last action; from the goal to the object as two columns, its place, and its
         surface: the way from each fingertip to the nearest point, and how far it extends from its
