@@ -95,17 +95,12 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("gains", "left"), [((100, 400, 800), 0.038), ((100,), 0.02), ((400,), 0.038)]
-)
-def test_fits_of_all_candidates_leave_the_valley_of_a_smaller_model(
-    shared_dir, tmp_path, gains, left
-):
-    """Fits that end in it leave 42, 41 and 42 mrad."""
+def test_fits_of_all_candidates_leave_the_valley_of_a_smaller_model(shared_dir, tmp_path):
+    """Fits that end in it leave 42 mrad."""
     recording = measured(shared_dir, "xl330_pendulum")
-    own = tuple(t for t in recording.trajectories if t.conditions["p_gain"] in gains)
+    own = tuple(t for t in recording.trajectories if t.conditions["p_gain"] == 400)
     report = explain(replace(recording, trajectories=own), None, tmp_path, workers=1)
-    assert report.held_out.identified_mae_rad < left
+    assert report.held_out.identified_mae_rad < 0.038
 
 
 @pytest.fixture(scope="module")
