@@ -147,6 +147,18 @@ def test_truth_is_where_the_objects_points_are(tmp_path):
     trainer.close()
 
 
+@pytest.mark.parametrize(("seen_share", "least", "most"), [(0.0, 0.0, 0.3), (1.0, 0.6, 1.0)])
+def test_a_camera_sees_the_hand_too(seen_share, least, most, tmp_path):
+    """Hands are of some thousand points, objects of 200."""
+    cfg = settings(0, tmp_path)
+    trainer = trainer_of(replace(cfg, clouds=replace(cfg.clouds, seen_share=seen_share)))
+    sight = next(trainer.source.looks(trainer.acting)).sight
+    apart = torch.cdist(sight.camera.nan_to_num(nan=9.0), sight.hand).amin(dim=-1)
+    seen = torch.isfinite(sight.camera[..., 0])
+    assert least <= (apart[seen] < 0.004).float().mean() <= most
+    trainer.close()
+
+
 @pytest.mark.parametrize("stage", [0, 1])
 def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
     cfg = settings(stage, tmp_path, batch=64, window=1)

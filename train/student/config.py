@@ -63,8 +63,9 @@ class CloudsCfg:
     """Noise of the object's points in stages 0 and 1 [m]."""
     scan_share: float = 0.25
     """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
-    seen_share: float = 0.5
-    """Stage 0: share of looks in which a camera sees one side; in others the surface is whole."""
+    seen_share: float = 0.75
+    """Stage 0: share of looks in which a camera sees one side; in others the surface is whole, which
+    is learned sooner."""
     shapes: int = 1024
     """Stage 0: shapes of an iteration, half made and half deformed objects."""
     hands: int = 1024
@@ -87,7 +88,7 @@ class SimulatedCfg:
 
     epochs: int = 4
     """Passes over what was done in an iteration."""
-    looks: int = 1024
+    looks: int = 4096
     """Looks of an iteration to learn to see from, of steps and environments at random."""
     belief_rad: float = 0.2
     """Stage 1: deviation of what is believed of rotations about each axis, at most [rad]."""

@@ -85,15 +85,22 @@ class MadeSequences:
     def looks(self, acting: ActingStudent) -> Iterator[Looks]:
         """Looks at them."""
         for _ in range(self._clouds.updates):
-            yield self.draw(acting, self._bank.draw(self._learn.batch))
+            shapes = self._bank.draw(self._learn.batch)
+            yield self.draw(acting, shapes, self._clouds.seen_share)
 
     def sequences(self) -> Iterator[Sequences]:
         """None: nobody acts."""
         yield from ()
 
     @torch.no_grad()
-    def draw(self, acting: ActingStudent, shapes: Tensor) -> Looks:
-        """A look at each of shapes, points [m] and normals [B, P, 6], by a belief that is wrong."""
+    def draw(self, acting: ActingStudent, shapes: Tensor, seen_share: float) -> Looks:
+        """A look at each of shapes, by a belief that is wrong.
+
+        Args:
+            acting: The student.
+            shapes: Points [m] and normals [B, P, 6].
+            seen_share: Share of looks by a camera; in others surfaces are whole.
+        """
         count, size = shapes.shape[:2]
         device = shapes.device
         shapes = shapes[:, torch.randperm(size, device=device)].float()
@@ -112,7 +119,7 @@ class MadeSequences:
             joint_qd=torch.randn_like(joint_q),
             action=uniform(-1.0, 1.0, *joint_q.shape, device=device),
             goal_quat=acting.build.goal_quat(random_matrices(count, device)),
-            points=self._seen(surfaces, posture, acting.build.hand_points(joint_q)),
+            points=self._seen(surfaces, posture, acting.build.hand_points(joint_q), seen_share),
             fresh=torch.zeros(count, dtype=torch.bool, device=device),
         )
         sight = acting.build(senses, off(truth))
@@ -124,11 +131,11 @@ class MadeSequences:
 
     @torch.no_grad()
     def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
-        """Errors at objects that are not learned from, after the passes of a first look."""
+        """Errors at objects that are not learned from, by a camera, after the passes of a first look."""
         if self._held_out is None:
             return {}
         views = 1 + self._learn.batch // len(self._held_out)
-        looks = self.draw(acting, self._held_out.repeat(views, 1, 1))
+        looks = self.draw(acting, self._held_out.repeat(views, 1, 1), seen_share=1.0)
         sight = looks.sight
         for _ in range(PASSES):
             sight = replace(sight, belief=acting.network.look(sight).belief)
@@ -148,7 +155,7 @@ class MadeSequences:
     def close(self) -> None:
         """Nothing."""
 
-    def _seen(self, surfaces: Tensor, posture: Tensor, hand: Tensor) -> Tensor:
+    def _seen(self, surfaces: Tensor, posture: Tensor, hand: Tensor, seen_share: float) -> Tensor:
         """Points that a camera sees of surfaces [B, P, 6] and hands [B, H, 3], or whole surfaces.
 
         NaN for what is not seen [B, K + H, 3].
@@ -161,7 +168,7 @@ class MadeSequences:
         nothing = torch.full_like(own, torch.nan)
         by_camera = torch.rand((len(surfaces), 1, 1), device=surfaces.device)
         return torch.where(
-            by_camera < self._clouds.seen_share,
+            by_camera < seen_share,
             torch.cat([seen, own], dim=1),
             torch.cat([whole, nothing], dim=1),
         )
