@@ -91,7 +91,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     @contextlib.contextmanager
     def connect(_, **twin_options):
         late = read_joints(load_hand(str(hand.path), layer=layer))
-        plant = NewtonPlant(late, SimCfg(physics_hz=3840.0))
+        plant = NewtonPlant(late, SimCfg(physics_hz=960.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(joints, bus)
 

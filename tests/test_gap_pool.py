@@ -6,13 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from gap_recordings import TRUE, recorded
+from gap_recordings import TRUE, made_up, recorded
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.assemble import curves
@@ -90,6 +91,6 @@ def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
     for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
         rows[0, column] = value
     exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
-    drawn = curves(problems, [(spec, rows)])
+    drawn = curves(problems, [spec], [replace(made_up((), 0.0), rows=rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)

@@ -11,10 +11,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from pxr import Sdf
 from scipy.optimize import brentq
 
-from vd.assets_usd.hand_layer import author
 from vd.paper import PAPER
 
 NAMESPACE = "vd:contact"
@@ -108,6 +106,10 @@ interval.
 
 def author_contact(prim: Any, identified: Identified) -> None:
     """Author what was identified on an object's root prim, USD's own attributes apart."""
+    from pxr import Sdf
+
+    from vd.assets_usd.hand_layer import author
+
     kind = Sdf.ValueTypeNames.DoubleArray
     for name, (value, low, high) in identified.items():
         author(prim, f"{NAMESPACE}:{name}", kind, list(value))

@@ -20,10 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_layer import author, new_layer, save_layer
 from vd.assets_usd.objects.contact_layer import (
     LAYER_FORMAT,
     Identified,
@@ -31,12 +29,6 @@ from vd.assets_usd.objects.contact_layer import (
     read_contact,
 )
 from vd.assets_usd.objects.geometry import Hull, Solid, Surface, principal_axes
-from vd.assets_usd.usd_prims import (
-    add_mesh,
-    define_body,
-    define_root,
-    numpy_quaternion,
-)
 from vd.command.files import atomic_path
 from vd.paper import PAPER
 
@@ -194,6 +186,10 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     Returns:
         The path.
     """
+    from pxr import Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+
+    from vd.assets_usd.usd_prims import add_mesh, define_body, define_root
+
     stage = Usd.Stage.CreateInMemory()
     prim = define_root(stage, model.name)
     define_body(prim, model.mass_kg, model.centre_of_mass, model.inertia, model.inertia_quat)
@@ -237,8 +233,10 @@ def _key(name: str) -> str:
     return name[0] + name.title().replace("_", "")[1:]
 
 
-def _layer(path: Path) -> Sdf.Layer | None:
+def _layer(path: Path) -> Any:
     """The layer of a USD file as it is now, with its sublayers in it; None if it is none."""
+    from pxr import Sdf, Tf, Usd
+
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
@@ -258,7 +256,7 @@ def _layer(path: Path) -> Sdf.Layer | None:
     return Usd.Stage.Open(layer).Flatten()
 
 
-def _custom(layer: Sdf.Layer | None) -> dict[str, Any]:
+def _custom(layer: Any) -> dict[str, Any]:
     """Custom data of an object's root prim; empty if the layer is no object of ours."""
     prim = layer and layer.GetPrimAtPath(f"/{layer.defaultPrim}")
     return dict(prim.customData.get(_CUSTOM, {})) if prim else {}
@@ -286,6 +284,10 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
+    from pxr import Usd, UsdPhysics
+
+    from vd.assets_usd.usd_prims import numpy_quaternion
+
     path = Path(path)
     if not path.is_file():
         raise ObjectError(f"{path}: no such object file")
@@ -359,6 +361,10 @@ def write_contact_layer(
     Raises:
         ObjectError: The file is no object.
     """
+    from pxr import Gf, Sdf
+
+    from vd.assets_usd.hand_layer import author, new_layer, save_layer
+
     item = read_object(item_file)
     layer = new_layer(
         item.name,
