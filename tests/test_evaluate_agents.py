@@ -191,3 +191,6 @@ def test_evaluation_at_rest_of_the_installed_policy_beats_doing_nothing(tmp_path
     assert all(e.start_error_rad <= 1.0 + 1e-3 for e in trained)
     assert sum(e.stopped for e in trained) >= 6 > sum(e.stopped for e in zero)
     assert "dclaw4-cube" in (tmp_path / "eval.html").read_text()
+    again = ["--device", "cpu", "--out", str(tmp_path / "again")]
+    assert main(["zero", "--at-rest", *flags, *again]) == 0
+    assert [row.episodes for row in Result.read(tmp_path / "again" / "eval.json").rows][1] == zero

@@ -158,6 +158,7 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
         MeshError: Two meshes would have one name; the message has both, and the remedy.
     """
     jobs: dict[str, Job] = {}
+    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
     for mesh in meshes:
         name = object_name(mesh)
         if name in jobs:
@@ -166,7 +167,9 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
                 f"{mesh}; name only the files that you want (such as FOLDER/*/textured.obj), "
                 "rename one, or import one into another set (--out)"
             )
-        row = read_sidecar(mesh.parent).get(mesh.stem, {})
+        if mesh.parent not in sidecars:
+            sidecars[mesh.parent] = read_sidecar(mesh.parent)
+        row = sidecars[mesh.parent].get(mesh.stem, {})
         source = row.get("source") or ""
         bracket = re.search(r"\(([^)]*)\)", source)
         jobs[name] = Job(

@@ -106,7 +106,7 @@ class SimulatedSequences:
         goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
         self.goals = self._scale * goals
         self.shapes = surfaces[:, points:]
-        """Points of each object that a look is drawn of [K, P, 6]."""
+        """Points of each object that a look is drawn of, unscaled [m] [O, P, 3]."""
         self._all = wp.ones(env.num_envs, dtype=wp.int32, device=env.env.device)
         self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
@@ -131,10 +131,14 @@ class SimulatedSequences:
                 return False
             pose = poses_in(self._base, self._pose)
             place = acting.build.belief_of(pose)
-            senses = self.senses(pose)
+            senses = self.senses()
             sight, told, belief = self._sighted(acting, senses, place)
             truth = acting.build.frames.belief_in(place, sight.frame)
-            looks.append(self._learned(sight, truth))
+            if self._camera is None:
+                looks.append(self._complete(acting, senses, pose, place))
+            else:
+                some = itemgetter(self._learned())
+                looks.append(Looks(each(sight, some), each(truth, some)))
             decision = acting.decide(told, sight.frame)
             label = self.labels()
             named = acting.build.frames.joints_in(label, sight.frame)
@@ -174,21 +178,35 @@ class SimulatedSequences:
         """
         if self._camera is None:
             acting.forget(senses.fresh)
-            sight = acting.build(senses, self._errors.about(place, senses.fresh))
+            belief = self._errors.about(place, senses.fresh)
+            sight = acting.build(senses, belief, clouds=False)
             return sight, acting.network.told(sight, sight.belief), sight.belief
         sight = acting.look(senses, off(place))
         look = acting.see(sight)
         return sight, look.told, look.belief
 
-    def _learned(self, sight: StudentInput, truth: Belief) -> Looks:
-        """Looks of a step to learn to see from, of environments at random."""
-        rows = torch.randperm(len(truth.position), device=self.blank.device)
-        taken = itemgetter(rows[: math.ceil(self._cfg.simulated.looks / self._cfg.learn.window)])
-        shown = each(sight, taken)
-        actual = each(truth, taken)
-        if self._camera is None:
-            shown = replace(shown, belief=off(actual))
-        return Looks(shown, actual)
+    def _learned(self) -> Tensor:
+        """Environments whose looks of a step are learned from, drawn at random, int64 [R]."""
+        order = torch.randperm(self.env.num_envs, device=self.blank.device)
+        return order[: math.ceil(self._cfg.simulated.looks / self._cfg.learn.window)]
+
+    def _complete(
+        self, acting: ActingStudent, senses: Senses, pose: Tensor, place: Belief
+    ) -> Looks:
+        """Looks of some environments at complete surfaces.
+
+        Args:
+            acting: The student.
+            senses: What is sensed of all.
+            pose: Poses of all objects in the base frame [N, 7].
+            place: What is to be believed of them, base frame [N].
+        """
+        rows = self._learned()
+        some = itemgetter(rows)
+        truth = each(place, some)
+        sensed_there = replace(each(senses, some), points=self._surfaces(pose[rows], rows))
+        sight = acting.build(sensed_there, off(truth), rows)
+        return Looks(sight, acting.build.frames.belief_in(truth, sight.frame))
 
     def looks(self, acting: ActingStudent) -> Iterator[Looks]:
         """Looks of all steps, in an order at random."""
@@ -212,15 +230,14 @@ class SimulatedSequences:
                     distance=done.distance[:, rows],
                 )
 
-    def senses(self, pose: Tensor) -> Senses:
-        """What is sensed now, for true poses of the objects in the base frame [N, 7]."""
+    def senses(self) -> Senses:
+        """What is sensed now; without a camera no points."""
         env = self.env.env
         if self._camera is None:
-            rows = torch.arange(len(pose), device=pose.device)
-            return sensed_with(env, self._complete(pose, rows))
+            return sensed_with(env, self._pose.new_empty((env.num_envs, 0, 3)))
         senses = sensed(env, self._camera)
         settings = self._cfg.simulated
-        draw = torch.rand(len(pose), device=pose.device)
+        draw = torch.rand(self.blank.shape, device=self.blank.device)
         spans = torch.randint_like(self.blank, 1, settings.blank_steps + 1)
         begins = (self.blank == 0) & (draw < settings.blank_probability)
         self.blank = torch.where(begins, spans, (self.blank - 1).clamp(min=0))
@@ -278,7 +295,7 @@ class SimulatedSequences:
         """Release the environments."""
         self.env.env.close()
 
-    def _complete(self, pose: Tensor, rows: Tensor) -> Tensor:
+    def _surfaces(self, pose: Tensor, rows: Tensor) -> Tensor:
         """Points all over the objects of environments ``rows`` at poses [R, 7], with noise [R, K, 3]."""
         clouds = self._cfg.clouds
         order = torch.randperm(self.shapes.shape[1], device=pose.device)[: clouds.points]

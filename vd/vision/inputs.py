@@ -227,7 +227,14 @@ class InputBuilder:
         orientation = quaternions(belief.rotation)
         return torch.cat([belief.position - middle, orientation], dim=1)
 
-    def __call__(self, senses: Senses, belief: Belief, rows: Tensor | None = None) -> StudentInput:
+    def __call__(
+        self,
+        senses: Senses,
+        belief: Belief,
+        rows: Tensor | None = None,
+        *,
+        clouds: bool = True,
+    ) -> StudentInput:
         """What is read of R steps.
 
         Args:
@@ -235,6 +242,7 @@ class InputBuilder:
                 complete surfaces (:func:`carried`).
             belief: What was believed before, base frame [R].
             rows: Environment of each row [R]; row i is of environment i by default.
+            clouds: Whether the hand's own points are made; without them nothing can be looked at.
         """
         joint_q = senses.joint_q
         poses = self._link_poses(joint_q)
@@ -245,9 +253,10 @@ class InputBuilder:
         velocity = PAPER.observation.velocity_scale * senses.joint_qd
         joints = torch.stack([position, velocity, senses.action], dim=1)
         named = self.frames.joints_in(joints, frame)[..., self._moved]
+        hand = self._points_on(poses) if clouds else senses.points[:, :0]
         return StudentInput(
             camera=carried(senses.points, turn),
-            hand=carried(self._points_on(poses), turn),
+            hand=carried(hand, turn),
             goal=self._goals if rows is None else self._goals[rows],
             goal_rotation=turn @ goal_rotation,
             proprioception=named.flatten(1),
