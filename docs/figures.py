@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from vd.command.versions import GAP, MEASURING, code_fingerprint
-from vd.evaluate.suite_run import fingerprint
+from vd.evaluate.suite_run import code_of, fingerprint
 from vd.paper import PAPER
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -116,9 +116,10 @@ def _evaluated(settings: Path) -> dict[str, Any]:
 
 def is_stale(name: str, figure: dict[str, Any]) -> bool:
     """Whether the policy or the code that measures is another since, or is not known."""
-    if figure.get("code") != _code_of(figure.get("command", "")):
-        return True
     line, _, policy = name.rpartition("/")
+    code = code_of(policy) if line else _code_of(figure.get("command", ""))
+    if figure.get("code") != code:
+        return True
     return bool(line) and figure["policy"] != fingerprint(policy)
 
 

@@ -8,18 +8,10 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-MEASURING = (
-    "kernels",
-    "assets_usd",
-    "sim",
-    "envs",
-    "sensors",
-    "tracking",
-    "vision",
-    "policy",
-    "evaluate",
-)
+MEASURING = ("kernels", "geometry", "assets_usd", "sim", "envs", "tracking", "policy", "evaluate")
 """Packages that decide what an evaluation gives."""
+SEEING = (*MEASURING, "sensors", "vision")
+"""The same of policies that see by a camera."""
 GAP = ("kernels", "logs", "gap")
 """Packages that decide what the gap workflow finds."""
 SHOWING = frozenset(

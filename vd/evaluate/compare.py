@@ -67,7 +67,7 @@ def compare(
     import warp as wp
 
     from vd.assets_usd.objects.sets import set_files
-    from vd.command.versions import code_fingerprint, installed_versions
+    from vd.command.versions import MEASURING, SEEING, code_fingerprint, installed_versions
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
@@ -111,7 +111,7 @@ def compare(
     software = {
         "device": wp.get_device(device).name,
         "date": f"{date.today()}",
-        "code": code_fingerprint(),
+        "code": code_fingerprint(SEEING if camera else MEASURING),
     }
     result = Result(tuple(rows), software | installed_versions(_PACKAGES))
     result.write(cfg.out / "eval.json")

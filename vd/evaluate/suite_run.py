@@ -22,7 +22,7 @@ import numpy as np
 from vd.command.config import to_dict
 from vd.command.files import make_folder, write_json
 from vd.command.line import parse
-from vd.command.versions import code_fingerprint
+from vd.command.versions import MEASURING, SEEING, code_fingerprint
 from vd.command.workers import run_tasks, shard
 from vd.evaluate.cfg import PASSED_ON, EvalCfg, parse_groups
 from vd.evaluate.claims import claimed
@@ -86,7 +86,7 @@ class SuiteTask:
         settings = to_dict(self.cfg)
         for name in _NOT_MEASURED:
             del settings[name]
-        return {"policy": self.weights, "code": code_fingerprint()} | settings
+        return {"policy": self.weights, "code": code_of(self.policy)} | settings
 
     def measured(self) -> Result | None:
         """What an earlier call measured with the same settings; None: nothing."""
@@ -243,6 +243,11 @@ def _parsed(line: str) -> EvalCfg:
 @cache
 def _by_camera(name: str) -> bool:
     return sees_clouds(open_policy(name, "cpu"))
+
+
+def code_of(policy: str) -> str:
+    """The fingerprint of the code that decides what an evaluation of a policy gives."""
+    return code_fingerprint(SEEING if _by_camera(policy) else MEASURING)
 
 
 def groups_of(entries: Sequence[SuiteEntry]) -> list[str]:
