@@ -404,10 +404,10 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
     """
     fitted = 1.0 - larger.rmse / smaller.rmse
     held_out = 1.0 - larger.held_out_rmse / smaller.held_out_rmse
+    certain = True
     if white(evidence, larger):
         gain = fitted
         before = smaller.rmse
-        certain = held_out > 0.0
     else:
         gain = min(fitted, held_out)
         before = smaller.held_out_rmse
@@ -465,8 +465,6 @@ def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
         return difference(evidence, best, other)[0] <= MIN_GAIN * best.held_out_rmse
     own = (best.rmse / evidence.floor) ** 2
     excess = (other.rmse / evidence.floor) ** 2 - own
-    if excess > 0.0:  # what needs more parameters to do worse is no equal
-        excess += 2.0 * PENALTY * max(len(other.x) - len(best.x), 0) * own
     return bool(excess < max(PENALTY, own - 1.0))
 
 
@@ -595,15 +593,11 @@ def nothing_named(
 
 
 def recovered(evidence: Evidence, plain: JointFit, fit: JointFit) -> float:
-    """Share of the squared gap that a model recovers, of fitted and held-out errors the lesser.
-
-    One motion can be all that shows a parameter. That no fit without it predicts it says nothing
-    against a model that leaves white residuals.
-    """
+    """Share of the squared gap that a model recovers, of fitted and held-out errors the lesser."""
     before = np.array([plain.rmse, plain.held_out_rmse])
     after = np.array([fit.rmse, fit.held_out_rmse])
     shares = (before**2 - after**2) / np.maximum(before**2 - evidence.floor**2, 1e-30)
-    return float(shares[0] if white(evidence, fit) else shares.min())
+    return float(shares.min())
 
 
 def said_of_families(
