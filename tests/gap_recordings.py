@@ -7,13 +7,12 @@ import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import chains
-from vd.gap.coordinates import Coordinate
+from vd.gap.coordinates import Coordinate, keys_of
 from vd.gap.design import design
 from vd.gap.fit import JointFit, JointProblem, JointSpec
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.workflow import baseline_of
-from vd.kernels.servo.effects import EFFECTS
 from vd.logs.recording import Recording, Trajectory
 
 ENCODER_COUNT = 2.0 * np.pi / 4096
@@ -85,7 +84,7 @@ def made_up(
 ) -> JointFit:
     """A fit with given held-out RMSE of each trajectory, and on what was fitted [rad]."""
     held_out = COUNT * np.broadcast_to(errors, COUNT.shape) ** 2
-    keys = ["p0", "p1", "p2", *(f"{name}.{EFFECTS[name].parameters[0].name}" for name in effects)]
+    keys = ["p0", "p1", "p2", *keys_of(effects)]
     size = len(keys)
     return JointFit(
         effects=effects,

@@ -79,7 +79,6 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "vd.gap.bench": _ABOVE,
     # The doors of the island: its commands, and those of its batteries and of programs.
     "vd.gap.cli": _ABOVE,
-    "vd.gap.contact_cli": _ABOVE,
     "vd.bench.cli": _ABOVE,
     "vd.api": _ABOVE,
 }

@@ -6,7 +6,7 @@ import pytest
 
 from vd.bench.cli import GapCommand
 from vd.gap.bench import battery as gap
-from vd.gap.bench.score import BATTERIES, Case, figures, markdown, score
+from vd.gap.bench.score import BATTERIES, Case, figures, score, table
 
 TRUTH = {
     "noise_floor_rad": 5e-4,
@@ -132,7 +132,7 @@ def test_a_failed_case_counts_against_every_goal():
         case("cogging", kind="outside"))]  # fmt: skip
     for figure in figures(failed):
         assert not figure.reached
-    assert "| first name right | >= 0.95 | 0.000 | 1 | no |" in markdown(failed)
+    assert "| first name right | >= 0.95 | 0.000 | 1 | no |" in table(figures(failed))
 
 
 def test_a_battery_goes_on_where_it_ended_and_names_what_is_hidden(tmp_path, monkeypatch, capsys):

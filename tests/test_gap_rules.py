@@ -127,10 +127,33 @@ def test_a_family_is_certain_before_its_member_is(evidence: Evidence) -> None:
     zone = made_up(("dead_zone",), 0.009)
     conclusion = conclude(evidence, PLAIN, [PLAIN, coulomb, load, zone], "")
     assert conclusion.verdict == "ambiguous" and not conclusion.names
-    assert conclusion.families == {"dry friction": "certain", "play": "excluded"}
+    assert conclusion.families == {"dry friction": "certain"}
     close = made_up(("dead_zone",), 0.004 + NOISE[::-1] - NOISE.mean())
     conclusion = conclude(evidence, PLAIN, [PLAIN, coulomb, load, close], "")
     assert {*conclusion.families.values()} <= {"likely", "untold"}
+
+
+def test_a_family_is_excluded_only_if_the_best_model_was_fitted_with_it(evidence: Evidence) -> None:
+    """Coulomb friction is the best; nothing is said of a dead zone that was tried alone."""
+    coulomb = made_up(("coulomb_friction",), 0.004)
+    zone = made_up(("dead_zone",), 0.009)
+    both = made_up(("coulomb_friction", "dead_zone"), 0.004)
+    assert "play" not in conclude(evidence, PLAIN, [PLAIN, coulomb, zone], "").families
+    tried = conclude(evidence, PLAIN, [PLAIN, coulomb, zone, both], "")
+    assert tried.families == {"dry friction": "certain", "play": "excluded"}
+
+
+def test_a_family_that_the_best_model_imitates_is_not_excluded(evidence: Evidence) -> None:
+    """Friction that differs between the directions is Coulomb friction beside an offset."""
+    direction = made_up(("asymmetric_friction",), 0.004)
+    bias = made_up(("asymmetric_friction", "encoder_bias"), 0.004)
+    delay = made_up(("asymmetric_friction", "command_delay"), 0.004)
+    conclusion = conclude(evidence, PLAIN, [PLAIN, direction, bias, delay], "")
+    assert conclusion.families == {
+        "dry friction": "certain",
+        "delay": "excluded",
+        "load or offset": "untold",
+    }
 
 
 def test_a_larger_model_is_good_only_if_none_that_it_contains_is(evidence: Evidence) -> None:

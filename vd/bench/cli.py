@@ -120,7 +120,7 @@ class GapCommand:
             check_file(self.json)
         from vd.command.files import write_text
         from vd.gap.bench.battery import battery, run_battery
-        from vd.gap.bench.score import figures, markdown
+        from vd.gap.bench.score import figures, table
 
         device = resolve_device(self.device)
         cases = battery(
@@ -140,13 +140,14 @@ class GapCommand:
         )
         if self.shard is not None:
             return 0
+        reached = figures(results)
         if self.json is not None:
-            known = [figure for figure in figures(results) if figure.values]
+            known = [figure for figure in reached if figure.values]
             row = {f.what: {"value": f.value, "cases": len(f.values)} for f in known}
             stamp: dict[str, object] = {"seed": self.first_seed, **measured_by(device, GAP)}
             write_json(self.json, stamp | {"rows": [row]})
-        write_text(self.out / "summary.md", markdown(results))
-        print(markdown(results))
+        write_text(self.out / "summary.md", table(reached))
+        print(table(reached))
         return 0
 
 

@@ -122,7 +122,7 @@ def assemble(
         final.append(joint.final)
         rows = _errors(joint, recording)
         errors += rows
-        gaps.append(_gap(joint, rows, rng))
+        gaps.append(_gap(joint, rows))
         for name in joint.final.effects:
             entries = effects if name in joint.conclusion.names else provisional
             entries.append(_effect(name, joint))
@@ -254,23 +254,17 @@ def _held_out(rows: Sequence[TrajectoryError], rng: np.random.Generator) -> Held
     )
 
 
-def _gap(
-    joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.Generator
-) -> JointGap:
+def _gap(joint: AnalysedJoint, rows: Sequence[TrajectoryError]) -> JointGap:
     """The errors of a joint, and what is concluded."""
     count, errors, _ = _table(rows)
-    sse = count * errors**2
-    old, new = rmse(sse, count, resamples(len(count), rng))
-    before, after = rmse(sse, count).tolist()
+    before, after = rmse(count * errors**2, count).tolist()
     conclusion = joint.conclusion
     answer = conclusion.verdict in ANSWERS
     return JointGap(
         joint=joint.name,
         noise_floor_rad=joint.spec.floor,
         baseline_rmse_rad=before,
-        baseline_ci95=interval(old),
         identified_rmse_rad=after,
-        identified_ci95=interval(new),
         verdict=conclusion.verdict,
         reason=conclusion.reason,
         open_sets=tuple(rules.open_sets(conclusion.good)) if answer else (),

@@ -13,7 +13,7 @@ from vd.command.device import warp_device
 from vd.command.files import check_folder
 from vd.command.line import parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
-from vd.gap.contact_cli import Contact, HideContact
+from vd.gap.contact_cli import Contact
 from vd.gap.convert import Convert
 
 if TYPE_CHECKING:
@@ -204,14 +204,13 @@ Command = (
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Contact, tyro.conf.subcommand("contact")]
-    | Annotated[HideContact, tyro.conf.subcommand("hide-contact")]
 )
 
 
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: _Step | HideCommand | Convert | Export | Contact | HideContact = parse(
+    command: _Step | HideCommand | Convert | Export | Contact = parse(
         Command, arguments, prog="vd-gap", description=__doc__
     )
     from vd.logs.recording import RecordingError

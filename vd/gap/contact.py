@@ -6,8 +6,7 @@ least squares to every motion that obeys it:
 
 - ``table_friction`` mu: a sliding object slows down by mu g, its path is s0 + v t - mu g t^2 / 2.
 - ``centre_of_mass`` d: in flight o(t) + R(t) d is on a parabola, o the object's origin.
-- ``restitution`` e: what hits the table under the centre of mass leaves with e times the speed it
-  came with.
+- ``restitution`` e: the point that hits the table leaves with e times the speed it came with.
 - ``mass`` m: while a pushed object slides, the impulse of the push is m (change of velocity + mu g
   time).
 - ``tip_compliance`` c: the rigid part of a pressing finger comes nearer by c times the force.
@@ -52,9 +51,7 @@ CLEAR_M = 0.003
 SURE_S = 0.15
 """Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
 SLIDING = 0.1
-"""Share of the top speed down to which a slide counts: slower, noise decides the direction."""
-MOVING = 0.3
-"""The same of a push."""
+"""Share of the top speed down to which a slide or a push counts: slower, noise decides the direction."""
 UPRIGHT_RAD = 0.05
 """Tilt within which a sliding object stays: more is tumbling or rolling."""
 TURNING = 0.3
@@ -63,12 +60,6 @@ to 2 %.
 """
 FLAT_M = 0.003
 """Points this close to the lowest one hit the table with it [m]."""
-CENTRAL = 0.25
-"""Share of the object's reach within which an impact is under the centre of mass: others are
-several.
-"""
-FAST_M_S = 1.0
-"""Impacts from this speed on tell the restitution: the flight after slower ones is too short."""
 IMPACT_S = 0.01
 """Longest impact: a rubber ball on wood takes half [s]."""
 PRESSED_N = 0.2
@@ -388,9 +379,6 @@ def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
         if before.stop == len(motion.time):
             return
         come, falling, touching = _touch(motion, before, state, None)
-        arms = motion.rotation[before][-1].apply(state.points - state.centre)[touching]
-        if -falling < FAST_M_S or np.linalg.norm(arms[:, :2].mean(0)) > CENTRAL * state.reach:
-            continue
         rising = state.unseen * unseen
         if after is not None:
             leave, rising, _ = _touch(motion, after, state, touching)
@@ -434,7 +422,7 @@ def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
     velocity, speed = _velocity(motion)
     pressing = np.linalg.norm(motion.force, axis=1) > PRESSED_N
-    sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
+    sliding = pressing & (speed > SLIDING * speed.max()) & _flat_on_table(motion, state)
     margin = round(SMOOTH_S / _step(motion))
     for whole in _stretches(sliding):
         # Velocities at the ends are of other motions too.

@@ -1,7 +1,4 @@
-"""``vd-gap contact`` and ``vd-gap hide-contact``.
-
-What an object's recorded motions tell of its contact.
-"""
+"""``vd-gap contact``: what an object's recorded motions tell of its contact."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -126,52 +123,3 @@ def contact_report(
         "object": item,
         "seconds": seconds,
     }
-
-
-@dataclass(frozen=True)
-class HideContact:
-    """Make a recording of an object in MuJoCo, with contact parameters hidden, to see whether they are found.
-
-    The plant shares nothing with the analysis; a tracker adds noise, late and missing samples. The
-    truth is written beside the folder.
-    """
-
-    out: Path
-    """Folder of the recording to write."""
-    object: str = "cube"
-    """Object set, or an object's file, whose first object it is."""
-    hide: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=VALUE such as table_friction=0.4, or centre_of_mass=X,Y,Z; give it again for a second
-    one.
-    """
-    seed: int = 0
-    """Seed of motions, solver and tracker."""
-
-    def run(self) -> int:
-        """Write the recording."""
-        from vd.assets_usd.objects.sets import load_set
-        from vd.gap.bench.hidden_contact import ContactPlant, hide_contact
-        from vd.gap.bench.hide import check_hidden, truth_path
-
-        check_hidden(self.out)
-        values = dict(map(_parse, self.hide))
-        hide_contact(ContactPlant(load_set(self.object)[0], values, seed=self.seed), self.out)
-        print(f"{self.out}\n{truth_path(self.out)}")
-        return 0
-
-
-def _parse(text: str) -> tuple[str, Any]:
-    """NAME=VALUE or NAME=X,Y,Z."""
-    from vd.assets_usd.objects.contact_layer import CONTACT
-
-    name, _, value = text.partition("=")
-    if name not in CONTACT:
-        raise ValueError(f"--hide {text}: there is no {name!r}; choose from {', '.join(CONTACT)}")
-    try:
-        numbers = tuple(map(float, value.split(",")))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != len(CONTACT[name].nominal):
-        form = "=X,Y,Z" if len(CONTACT[name].nominal) > 1 else "=NUMBER"
-        raise ValueError(f"--hide {text}: give {name}{form}")
-    return name, numbers[0] if len(numbers) == 1 else numbers

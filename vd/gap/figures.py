@@ -1,6 +1,6 @@
 """Figures of a gap report.
 
-The gap of each joint, curves before and after, and what remains of them.
+Curves before and after, and what remains of them.
 
 Angles are shown in mrad where they are errors and in rad where they are positions.
 """
@@ -22,42 +22,6 @@ WINDOW_S = 6.0
 tuned.
 """
 STYLE = {"axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
-
-
-def gap_figure(report: Report) -> Figure:
-    """Held-out gap of every joint before and after, with intervals, and the noise floor."""
-    joints = report.joints
-    figure = Figure(figsize=(9.0, 1.2 + 0.5 * max(len(joints), 2)), layout="constrained")
-    axes = figure.add_subplot()
-    places = -np.arange(len(joints))
-    names = []
-    floors = []
-    before = []
-    after = []
-    for joint in joints:
-        names.append(joint.joint)
-        floors.append(1e3 * joint.noise_floor_rad)
-        before.append((joint.baseline_rmse_rad, *joint.baseline_ci95))
-        after.append((joint.identified_rmse_rad, *joint.identified_ci95))
-    models = (
-        ("before: the plain servo model", ORANGE, before),
-        ("after: the identified model", GREEN, after),
-    )
-    for side, (label, color, numbers) in zip((0.2, -0.2), models, strict=True):
-        values, lows, highs = 1e3 * np.array(numbers).T
-        axes.barh(places + side, values, 0.36, color=color, alpha=0.75, label=label)
-        axes.hlines(places + side, lows, highs, color=INK, linewidth=1.4)
-        for place, value, high in zip(places, values, highs, strict=True):
-            axes.text(
-                np.nanmax([value, high]), place + side, f"  {value:.3g}", va="center", fontsize=8
-            )
-    axes.vlines(floors, places - 0.4, places + 0.4, color=BLUE, linewidth=2.0, label="noise floor")
-    axes.set_yticks(places, names)
-    axes.set_xlim(left=0.0)
-    axes.margins(x=0.08)
-    axes.set_xlabel("root-mean-square error on held-out motions [mrad], with 95 % intervals")
-    figure.legend(loc="outside upper center", ncols=3)
-    return figure
 
 
 def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) -> Figure:

@@ -25,7 +25,7 @@ from vd.kernels.servo.effects import EFFECTS
 
 REPORT_JSON = "report.json"
 REPORT_HTML = "report.html"
-FIGURES = ("gap.png", "overlay_*.png", "residual_*.png")
+FIGURES = ("overlay_*.png", "residual_*.png")
 """Those of an earlier analysis go; other motions were drawn."""
 
 _VERDICTS = {
@@ -61,7 +61,6 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
     overlays = []
     residuals = {}
     with mpl.rc_context(figures.STYLE):
-        gap = draw("gap", figures.gap_figure(report))
         for joint, index in figures.chosen_overlays(report, curves):
             file = curves.files[index]
             overlay = figures.overlay_figure(report, curves, joint, index)
@@ -78,7 +77,6 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         words=words,
         headline=_headline(report),
         joints=[_joint_row(report, one) for one in report.joints],
-        gap=gap,
         overlays=overlays,
         residuals=residuals,
         trajectories=[*map(_trajectory_row, report.trajectories)],
@@ -123,6 +121,9 @@ def _joint_row(report: Report, one: JointGap) -> Row:
             where.append(text)
     return (
         one.joint,
+        mrad(one.noise_floor_rad),
+        mrad(one.baseline_rmse_rad),
+        mrad(one.identified_rmse_rad),
         "; ".join(where) or "nothing",
         _VERDICTS[one.verdict].lower(),
         plain(one.reason),

@@ -31,7 +31,7 @@ Verdict = Literal["effects", "ambiguous", "unknown", "under_excited", "no_gap"]
 """That of a recording is the first of these that some joint has."""
 Certainty = Literal["certain", "likely", "untold", "excluded"]
 """What is known of a family of causes: all good models have it; those that have it predict more
-motions best than luck gives; no more; none has it."""
+motions best than luck gives; no more; none has it, and the best was fitted with it."""
 Interval = tuple[float, float]
 
 
@@ -116,9 +116,7 @@ class JointGap:
     joint: str
     noise_floor_rad: float
     baseline_rmse_rad: float
-    baseline_ci95: Interval
     identified_rmse_rad: float
-    identified_ci95: Interval
     verdict: Verdict
     reason: str
     """One sentence: why this verdict."""

@@ -17,7 +17,7 @@ simulate nothing.
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import get_args
 
@@ -128,11 +128,9 @@ MIN_GAIN = 0.05
 """Share of the error that an addition to a model must remove, and by which a model is worse than
 another. Of an addition, half turns none of 41 joints, twice turns one."""
 PENALTY = 0.01
-"""Relative error that a further effect, and each of its parameters, must earn. Half and twice turn
-none of 41 joints."""
-EXCESS = 0.005
-"""What a model must leave more than one with white residuals, in squared noise floors, to be worse:
-thousands of samples carry that difference. Half and twice turn none of 41 joints."""
+"""Relative error that a further effect, and each of its parameters, must earn. And what a model must
+leave more than one with white residuals, in squared noise floors, to be worse: thousands of samples
+carry that difference. Half and twice turn none of 41 joints."""
 FEW = 5
 """Folds below which each motion stands for itself in intervals. Not tuned."""
 RECOVERED = 0.5
@@ -172,6 +170,11 @@ class Evidence:
 
 
 # 1. Which effects are tried on a joint.
+
+
+def families_of(effects: Collection[str]) -> set[str]:
+    """Families that some effects are of."""
+    return {name for name, family in FAMILIES.items() if family.effects.intersection(effects)}
 
 
 def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
@@ -401,10 +404,10 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
     """
     fitted = 1.0 - larger.rmse / smaller.rmse
     held_out = 1.0 - larger.held_out_rmse / smaller.held_out_rmse
+    certain = True
     if white(evidence, larger):
         gain = fitted
         before = smaller.rmse
-        certain = held_out > 0.0
     else:
         gain = min(fitted, held_out)
         before = smaller.held_out_rmse
@@ -462,9 +465,7 @@ def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
         return difference(evidence, best, other)[0] <= MIN_GAIN * best.held_out_rmse
     own = (best.rmse / evidence.floor) ** 2
     excess = (other.rmse / evidence.floor) ** 2 - own
-    if excess > 0.0:  # what needs more parameters to do worse is no equal
-        excess += 2.0 * PENALTY * max(len(other.x) - len(best.x), 0) * own
-    return bool(excess < max(EXCESS, own - 1.0))
+    return bool(excess < max(PENALTY, own - 1.0))
 
 
 def good_models(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
@@ -516,7 +517,7 @@ class Conclusion:
         good: The good models, the best first.
         shares: Share of the motions that each of them predicts best.
         names: Effects that all good models share, where that is an answer.
-        families: What is known of each family of which some effect was tried.
+        families: What is known of each family that was tried with the best model.
     """
 
     verdict: Verdict
@@ -545,7 +546,7 @@ def conclude(
     weights = shares(evidence, good)
     if not good[0].effects:
         verdict, reason = nothing_named(evidence, plain, fits, loose)
-        families = families_of(good, weights, fits) if verdict == "no_gap" else {}
+        families = said_of_families(good, weights, fits) if verdict == "no_gap" else {}
         return Conclusion(verdict, reason, plain, tuple(good), weights, (), families)
     share = recovered(evidence, plain, good[0])
     if share < RECOVERED:
@@ -558,7 +559,7 @@ def conclude(
     for fit in good:
         shared.intersection_update(fit.effects)
     names = tuple(sorted(shared, key=good[0].effects.index))
-    families = families_of(good, weights, fits)
+    families = said_of_families(good, weights, fits)
     certain = [name for name in families if families[name] == "certain"]
     if names:
         reason = f"all models that are not worse than the best have {listing(names)}"
@@ -592,43 +593,43 @@ def nothing_named(
 
 
 def recovered(evidence: Evidence, plain: JointFit, fit: JointFit) -> float:
-    """Share of the squared gap that a model recovers, of fitted and held-out errors the lesser.
-
-    One motion can be all that shows a parameter. That no fit without it predicts it says nothing
-    against a model that leaves white residuals.
-    """
+    """Share of the squared gap that a model recovers, of fitted and held-out errors the lesser."""
     before = np.array([plain.rmse, plain.held_out_rmse])
     after = np.array([fit.rmse, fit.held_out_rmse])
     shares = (before**2 - after**2) / np.maximum(before**2 - evidence.floor**2, 1e-30)
-    return float(shares[0] if white(evidence, fit) else shares.min())
+    return float(shares.min())
 
 
-def families_of(
+def said_of_families(
     good: Sequence[JointFit], weights: np.ndarray, fits: Sequence[JointFit]
 ) -> dict[str, Certainty]:
-    """What good models say of each family: certain if all have it, excluded if none.
+    """What good models say of each family: certain if all have it.
 
     Likely if those that have it predict so many motions best that as many by chance, as of tossed
-    coins, are not to be expected; untold if not.
+    coins, are not to be expected; untold if not, or if a good model imitates it. Excluded if the
+    best model was fitted with it and does not earn it.
     """
     motions = len(good[0].count)
+    best = {*good[0].effects}
+    imitated: set[str] = set()
+    for fit in good:
+        for name in fit.effects:
+            imitated |= families_of(TOGETHER.get(name, ()))
     tried: set[str] = set()
     for fit in fits:
-        tried.update(fit.effects)
+        if best.issubset(fit.effects):
+            tried |= families_of({*fit.effects} - best)
     result: dict[str, Certainty] = {}
-    for name, family in FAMILIES.items():
-        best = 0.0
-        having = 0
-        for fit, weight in zip(good, weights, strict=True):
-            if family.effects.intersection(fit.effects):
-                having += 1
-                best += weight * motions
-        if having == len(good):
+    for name in FAMILIES:
+        having = np.array([name in families_of(fit.effects) for fit in good])
+        if having.all():
             result[name] = "certain"
-        elif having:
-            luck = binom.sf(round(best) - 1, motions, 0.5)
+        elif having.any():
+            luck = binom.sf(round(weights @ having * motions) - 1, motions, 0.5)
             result[name] = "likely" if luck < 1.0 - CONFIDENCE else "untold"
-        elif tried & family.effects:
+        elif name in imitated:
+            result[name] = "untold"
+        elif name in tried:
             result[name] = "excluded"
     return result
 

@@ -306,11 +306,6 @@ def _unknown_or_near(result: Mapping[str, Any]) -> bool:
     return abstains or not any({*near}.isdisjoint(group) for group in result["sets"])
 
 
-def markdown(results: Results) -> str:
-    """The figures as a table."""
-    return table(figures(results))
-
-
 def table(rows: Iterable[Figure]) -> str:
     """Figures as a table."""
     return "\n".join([*HEAD, *map(Figure.row, rows), ""])
