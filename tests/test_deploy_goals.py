@@ -13,9 +13,9 @@ HOLE_M = 0.012
 """Radius of what is missing around three spots."""
 
 
-@pytest.fixture(scope="module", params=[0, 90])
+@pytest.fixture(scope="module", params=[0, 18])
 def item(request):
-    return load_set("procedural-150-seed0")[request.param]
+    return load_set("procedural-24-seed0")[request.param]
 
 
 def surface(item, count=25_000, seed=1):

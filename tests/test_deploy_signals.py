@@ -67,10 +67,15 @@ def drive(path: str, what: str, words: str) -> None:
 
 @pytest.fixture(scope="module")
 def start():
-    """Starts such processes; what they import is imported once."""
+    """Starts such processes; what they import is imported once.
+
+    Their server has its path from the environment alone, and passes over what it does not find.
+    """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["test_deploy_signals", "vd.deploy.hardware.home"])
-    return context.Process
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+        yield context.Process
 
 
 class Driver:

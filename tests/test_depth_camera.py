@@ -33,7 +33,7 @@ def scenes():
 
     def get(device):
         if device not in built:
-            objects = load_set("procedural-150-seed0")[::60]
+            objects = load_set("procedural-24-seed0")[::8]
             built[device] = posed_scene(objects, WORLDS, "dclaw4", device, 3, visuals=True)
         return built[device]
 

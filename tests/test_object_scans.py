@@ -61,7 +61,7 @@ def test_points_that_enclose_nothing_are_refused():
 
 def test_an_object_is_known_by_its_scan(device):
     """Surface and samples agree, so that it is looked for by its surface, inside and outside told apart."""
-    items = load_set("procedural-150-seed0")[:40:20]
+    items = load_set("procedural-24-seed0")[:21:20]
     known = [
         known_by_points(item, scan(item.surface_points, np.random.default_rng(i)), device)
         for i, item in enumerate(items)

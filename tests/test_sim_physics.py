@@ -177,7 +177,7 @@ def test_a_pinch_holds_and_a_slippery_one_lets_go(cube):
 
 
 def test_procedural_objects_come_to_rest():
-    objects = load_set("procedural-150-seed0")[::15]
+    objects = load_set("procedural-24-seed0")[::2]
     results = rest(objects, CFG)
     resting = [r for r in results if r.rests]
     assert len(resting) >= 0.9 * len(results), [r for r in results if not r.rests]
