@@ -62,7 +62,6 @@ class HandImport:
         """Import a hand."""
         from vd.assets_usd.hand_import.importer import import_hand
         from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
-
         from vd.evaluate.bowl import share_kept
 
         judge = share_kept if self.bowl else None

@@ -212,15 +212,17 @@ def roots(tree: Tree) -> np.ndarray:
     return np.stack([tree.joints[joints[0]].parent_frame[:3] for joints in tree.fingers])
 
 
-def bent(tree: Tree, share: float) -> np.ndarray:
+def bent(tree: Tree, share: float | np.ndarray) -> np.ndarray:
     """Angles [D] [rad] of an open hand whose joints go a share of their way to the wider side.
 
-    Joints with as much way to both sides move fingers sideways, and stay.
+    The share is one, or that of each finger [F]. Joints with as much way to both sides move fingers
+    sideways, and stay.
     """
     lower, upper = _limits(tree)
     open_q = np.clip(0.0, lower, upper)
     wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
     one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
+    share = np.repeat(np.broadcast_to(share, len(tree.fingers)), list(map(len, tree.fingers)))
     angles = tree.followed(np.where(one_sided, open_q + share * (wider - open_q), open_q))
     return np.clip(angles, lower, upper)
 

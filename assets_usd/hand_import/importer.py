@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, compose
 from vd.assets_usd.hand_import.author import Author
@@ -38,8 +39,11 @@ unit.
 """
 BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
-BENDS = tuple(0.05 * i for i in range(9))
-"""By which a start may be bent (:func:`vd.assets_usd.hand_import.guess.bent`)."""
+BENDS = (0.1, 0.2, 0.3, 0.4)
+"""By which all fingers are bent (:func:`vd.assets_usd.hand_import.guess.bent`), and then
+BEND_STEP more or less, one after the other: outer ones are walls. Chosen to take a minute.
+"""
+BEND_STEP = 0.2
 ANGLE_DIGITS = 2
 """Of a start that is proposed [rad], to be copied."""
 LEAST_DAMPING_RATIO = 0.2
@@ -130,27 +134,40 @@ def _with_bowl(
     tree = grow(source, said)
     stance = take_stance(tree, said)
     _check_units(source, tree, stance)
+    if Rotation.from_quat(stance.mount[3:]).apply(stance.palm)[2] <= 0.0:
+        return said, []
     size = stance.workspace.size_m
     place = replace(said.workspace, size=size, fall=stance.workspace.fall_m)
     said = replace(said, workspace=place)
-    kept: dict[float, float] = {}
-    for bend in BENDS:
-        start = bent(tree, bend)
+    near = _untouched(source, tree)
+    best = np.zeros(len(tree.fingers))
+    kept = -1.0
+
+    def is_better(shares: np.ndarray) -> bool:
+        nonlocal best, kept
+        start = bent(tree, shares)
         mount, workspace = stand(tree, stance.tips, start, stance.palm, said)
         bowl = replace(stance, start=start, mount=mount, workspace=workspace)
         with tempfile.TemporaryDirectory() as scratch:
-            file = Author(tree, bowl, said, "bowl").write(Path(scratch), _untouched(source, tree))
-            if not read_hand(file).palm_up:
-                return said, []
-            kept[bend] = share_kept(file)
-    bend = max(kept, key=lambda tried: kept[tried])
-    start = bent(tree, bend).round(ANGLE_DIGITS)
+            share = share_kept(Author(tree, bowl, said, "bowl").write(Path(scratch), near))
+        if share <= kept:
+            return False
+        best = shares
+        kept = share
+        return True
+
+    for bend in BENDS:
+        is_better(np.full(len(best), bend))
+    for step in BEND_STEP * np.eye(len(best)):
+        if not is_better(best + step):
+            is_better(best - step)
+    start = bent(tree, best).round(ANGLE_DIGITS).tolist()
     angles = {}
-    for joint, angle in zip(tree.joints, start.tolist(), strict=True):
+    for joint, angle in zip(tree.joints, start, strict=True):
         if joint.mimic is None:
             angles[joint.name] = angle
     note = (
-        f"guess: starts as a bowl, bent by {bend:.0%}, in which {kept[bend]:.0%} of dropped cubes "
+        f"guess: starts as a bowl in which {kept:.0%} of dropped cubes "
         f"stay (start); they measure {1e3 * size[0]:.0f} to {1e3 * size[1]:.0f} mm (workspace)"
     )
     return replace(said, start=angles), [note]
