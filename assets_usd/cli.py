@@ -55,15 +55,17 @@ class HandImport:
     out: Path | None = None
     """Folder to write to; by default one of the asset cache, named after the hand."""
     bowl: bool = True
-    """Search the start pose of a palm that looks up, where none is described: what is dropped stays
-    in it. It takes a minute."""
+    """Choose the start pose of a palm that looks up, where none is described: dropped cubes stay in
+    it. It takes a minute."""
 
     def run(self) -> int:
         """Import a hand."""
         from vd.assets_usd.hand_import.importer import import_hand
         from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
+        from vd.evaluate.bowl import share_kept
 
-        done = import_hand(self.file, self.out, self.describe, bowl=self.bowl)
+        judge = share_kept if self.bowl else None
+        done = import_hand(self.file, self.out, self.describe, judge)
         print("\n".join([*done.notes, *(f"warning: {text}" for text in done.warnings)]))
         print(joint_table(done.hand, done.sources))
         hand_sheet(done.hand, done.sources, done.hand.path.with_suffix(".png"))

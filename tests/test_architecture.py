@@ -44,6 +44,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.command": ("vd.command",),
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": USD,
+    "vd.assets_usd.cli": (*USD, "vd.evaluate"),  # chooses a start by the task
     "vd.logs": (*LEAVES, "vd.assets_usd", "vd.logs"),
     "vd.sim": (*USD, "vd.sim"),
     "vd.sim.replay": ("vd.logs.motions", "vd.kernels", "vd.assets_usd", "vd.sim"),

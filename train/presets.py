@@ -24,7 +24,7 @@ from vd.envs.cfg import (
 )
 from vd.evaluate.conditions import CONDITIONS
 from vd.paper import PAPER
-from vd.sim.cfg import SimCfg
+from vd.sim.cfg import MANY_COLLIDERS, SimCfg
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
 TRAINING_SET = ("procedural-150-seed0",)
@@ -182,9 +182,7 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
         num_envs=8192,  # hands of many colliders fill a GPU sooner
         episode_s=10.0,  # what falls ends it; what is held meets many goals
         failures_per_million=20.0,
-        # Room for the contacts of LEAP's 71 colliders: none was lost in 252 M steps. Too little
-        # stops a run.
-        sim=SimCfg(njmax=320, nconmax=48, nccdmax=12),
+        sim=MANY_COLLIDERS,
         observation=ObservationCfg(shape="full", canonical=True),  # such hands have no symmetry
         # Lost is also every goal to come, so a fall costs half of what it does over a table. Chosen
         # once, as are the thresholds of success; tried with LEAP's cube alone, half and twice are

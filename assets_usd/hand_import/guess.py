@@ -212,6 +212,21 @@ def roots(tree: Tree) -> np.ndarray:
     return np.stack([tree.joints[joints[0]].parent_frame[:3] for joints in tree.fingers])
 
 
+def bent(tree: Tree, share: float | np.ndarray) -> np.ndarray:
+    """Angles [D] [rad] of an open hand whose joints go a share of their way to the wider side.
+
+    The share is one, or that of each finger [F]. Joints with as much way to both sides move fingers
+    sideways, and stay.
+    """
+    lower, upper = _limits(tree)
+    open_q = np.clip(0.0, lower, upper)
+    wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
+    one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
+    share = np.repeat(np.broadcast_to(share, len(tree.fingers)), list(map(len, tree.fingers)))
+    angles = tree.followed(np.where(one_sided, open_q + share * (wider - open_q), open_q))
+    return np.clip(angles, lower, upper)
+
+
 def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
     """Where the palm looks: where the fingertips go when fingers bend.
 
@@ -219,15 +234,10 @@ def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
     """
     if said.palm is not None:
         return np.array(said.palm) / np.linalg.norm(said.palm)
-    lower, upper = _limits(tree)
-    open_q = tree.followed(np.clip(0.0, lower, upper))
-    wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
-    one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
-    bent_q = tree.followed(np.where(one_sided, open_q + BENT * (wider - open_q), open_q))
-    opened = tip_points(tree, tips, open_q)
+    opened = tip_points(tree, tips, bent(tree, 0.0))
     along = opened - roots(tree)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    ways = tip_points(tree, tips, bent_q) - opened
+    ways = tip_points(tree, tips, bent(tree, BENT)) - opened
     ways -= np.sum(ways * along, axis=1, keepdims=True) * along
     length = np.linalg.norm(ways, axis=1).mean()
     palm = ways.mean(axis=0)

@@ -3,19 +3,21 @@
 import math
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandError, HandModel, compose
+from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, compose
 from vd.assets_usd.hand_import.author import Author
-from vd.assets_usd.hand_import.bowl import OBJECTS, add_shape, find_bowl
 from vd.assets_usd.hand_import.description import BUILT_IN, Description, read_description
 from vd.assets_usd.hand_import.guess import (
     Stance,
+    bent,
     critical_damping,
     roots,
     stand,
@@ -37,6 +39,11 @@ unit.
 """
 BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
+BENDS = (0.1, 0.2, 0.3, 0.4)
+"""By which all fingers are bent (:func:`vd.assets_usd.hand_import.guess.bent`), and then
+BEND_STEP more or less, one after the other: outer ones are walls. Chosen to take a minute.
+"""
+BEND_STEP = 0.2
 ANGLE_DIGITS = 2
 """Of a start that is proposed [rad], to be copied."""
 LEAST_DAMPING_RATIO = 0.2
@@ -60,7 +67,10 @@ class Imported:
 
 
 def import_hand(
-    path: Path, out: Path | None, describe: str | Path | None = None, *, bowl: bool = False
+    path: Path,
+    out: Path | None,
+    describe: str | Path | None = None,
+    share_kept: Callable[[Path], float] | None = None,
 ) -> Imported:
     """Import a hand.
 
@@ -70,15 +80,16 @@ def import_hand(
             from which commands take the hand by its name.
         describe: YAML, or the name of a built-in one
             (:mod:`vd.assets_usd.hand_import.description`).
-        bowl: Whether to search the start of a palm that looks up, if it is not described.
+        share_kept: Share of dropped objects that stay in the hand of a USD. By it the start of a
+            palm that looks up is chosen, if none is described; None: all joints at zero.
 
     Raises:
         HandError: The file cannot be imported; says why and what to do.
     """
     said = read_description(describe)
     searched: list[str] = []
-    if bowl and not said.start:
-        said, searched = _with_bowl(path, said)
+    if share_kept is not None and not said.start:
+        said, searched = _with_bowl(path, said, share_kept)
     source = read_source(path)
     tree = grow(source, said)
     stance = take_stance(tree, said)
@@ -112,8 +123,10 @@ def import_hand(
     return Imported(read_hand(folder / target.name), tree.notes, warnings, tree.names)
 
 
-def _with_bowl(path: Path, said: Description) -> tuple[Description, list[str]]:
-    """A description with the start that was found, and what to say of it.
+def _with_bowl(
+    path: Path, said: Description, share_kept: Callable[[Path], float]
+) -> tuple[Description, list[str]]:
+    """A description with the start in which most of what falls stays, and what to say of it.
 
     Of a palm that does not look up as it is.
     """
@@ -121,23 +134,43 @@ def _with_bowl(path: Path, said: Description) -> tuple[Description, list[str]]:
     tree = grow(source, said)
     stance = take_stance(tree, said)
     _check_units(source, tree, stance)
-    with tempfile.TemporaryDirectory() as scratch:
-        author = Author(tree, stance, said, "bowl")
-        hand = read_hand(author.write(Path(scratch), _untouched(source, tree)))
-    if not hand.palm_up:
+    if Rotation.from_quat(stance.mount[3:]).apply(stance.palm)[2] <= 0.0:
         return said, []
-    open_place = stance.workspace
-    place = replace(said.workspace, size=open_place.size_m, fall=open_place.fall_m)
+    size = stance.workspace.size_m
+    place = replace(said.workspace, size=size, fall=stance.workspace.fall_m)
     said = replace(said, workspace=place)
-    found = find_bowl(hand, lambda q: stand(tree, stance.tips, q, stance.palm, said))
-    angles = dict(zip(tree.names, found.start.round(ANGLE_DIGITS).tolist(), strict=True))
-    led = [joint.name for joint in tree.joints if joint.mimic is not None]
+    near = _untouched(source, tree)
+    best = np.zeros(len(tree.fingers))
+    kept = -1.0
+
+    def is_better(shares: np.ndarray) -> bool:
+        nonlocal best, kept
+        start = bent(tree, shares)
+        mount, workspace = stand(tree, stance.tips, start, stance.palm, said)
+        bowl = replace(stance, start=start, mount=mount, workspace=workspace)
+        with tempfile.TemporaryDirectory() as scratch:
+            share = share_kept(Author(tree, bowl, said, "bowl").write(Path(scratch), near))
+        if share <= kept:
+            return False
+        best = shares
+        kept = share
+        return True
+
+    for bend in BENDS:
+        is_better(np.full(len(best), bend))
+    for step in BEND_STEP * np.eye(len(best)):
+        if not is_better(best + step):
+            is_better(best - step)
+    start = bent(tree, best).round(ANGLE_DIGITS).tolist()
+    angles = {}
+    for joint, angle in zip(tree.joints, start, strict=True):
+        if joint.mimic is None:
+            angles[joint.name] = angle
     note = (
-        f"guess: starts as a bowl in which {found.kept:.0%} of {OBJECTS} dropped spheres and cubes "
-        f"stay, for {found.kept_before:.0%} with joints at zero (start); they measure "
-        f"{1e3 * open_place.size_m[0]:.0f} to {1e3 * open_place.size_m[1]:.0f} mm (workspace)"
+        f"guess: starts as a bowl in which {kept:.0%} of dropped cubes "
+        f"stay (start); they measure {1e3 * size[0]:.0f} to {1e3 * size[1]:.0f} mm (workspace)"
     )
-    return replace(said, start={n: q for n, q in angles.items() if n not in led}), [note]
+    return replace(said, start=angles), [note]
 
 
 def _replaced(path: Path, source: Source) -> list[str]:
@@ -260,8 +293,7 @@ def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int
     links = hand.forward_kinematics(hand.start)
     spec = mujoco.MjSpec()
     for number, shape in enumerate(hand.shapes):
-        pose = compose(links[shape.link], shape.frame)
-        add_shape(spec, spec.worldbody, shape, f"hull {number}", pose)
+        _add_shape(spec, shape, f"hull {number}", compose(links[shape.link], shape.frame))
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -274,3 +306,18 @@ def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int
         if depth > DEEP_M:
             depths[a, b] = max(depth, depths.get((a, b), 0.0))
     return depths
+
+
+def _add_shape(spec: mujoco.MjSpec, shape: CollisionShape, name: str, pose: np.ndarray) -> None:
+    """Add a collider to the world of MuJoCo at a pose [7], a hull by this name."""
+    kind = "mesh" if shape.kind == "hull" else shape.kind
+    geom = spec.worldbody.add_geom(
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
+        size=[*shape.size, 0.0, 0.0][:3],
+        pos=pose[:3],
+        quat=pose[[6, 3, 4, 5]],
+    )
+    if kind == "mesh":
+        geom.meshname = name
+        mesh = spec.add_mesh(name=name, uservert=shape.vertices.ravel())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
