@@ -19,7 +19,7 @@ from vd.evaluate.claims import lost_at_once, success_without_table
 from vd.evaluate.cli import main
 from vd.evaluate.conditions import Condition
 from vd.evaluate.result import Result
-from vd.evaluate.suite import OWN_SETS, Suite, read_suite
+from vd.evaluate.suite import OWN_SETS, Suite, SuiteEntry, read_suite
 from vd.evaluate.trace import Episode
 from vd.paper import ResultConstants
 from vd.policy.agents import SHIPPED_POLICIES
@@ -247,6 +247,17 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
         and "--condition off-centre" in text
         and "72.3 %" not in text
     )
+
+
+def test_lines_of_other_objects_are_not_compared(found):
+    row = next(row for row in found if row.headline)
+    others = replace(row, condition="others", object_names=("something else",))
+    entries = [SuiteEntry(name, teacher="vd-eval POLICY") for name in ("first", "same", "others")]
+    rows = [replace(row, condition=entry.name) for entry in entries[:2]]
+    table = suite_run.robust_table(Result((*rows, others)), entries)
+    shown = [line["points from first"] for line in table]
+    assert shown[0] == shown[2] == suite_run.NOTHING
+    assert shown[1].startswith("+0.0")
 
 
 def test_our_objects_stand_for_the_papers_where_none_are_given(monkeypatch):

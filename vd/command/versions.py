@@ -2,6 +2,8 @@
 
 import ast
 import hashlib
+import io
+import tokenize
 from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -35,8 +37,8 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
 def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
     """What tells the code that measures from other code: a digest of its packages' statements.
 
-    Hands and their descriptions count too. Comments, docstrings and the form of modules do not,
-    nor does where it is installed.
+    Hands and their descriptions count too. Comments, docstrings and blank lines do not, nor does
+    where it is installed.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -56,13 +58,15 @@ def code_fingerprint(packages: tuple[str, ...] = MEASURING) -> str:
 
 
 def _statements(text: str) -> str:
-    """A module without comments, docstrings, and how its lines are broken."""
-    return ast.unparse(_WithoutDocstrings().visit(ast.parse(text)))
-
-
-class _WithoutDocstrings(ast.NodeTransformer):
-    """Drops statements that are nothing but text."""
-
-    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:  # as ast calls it
-        """One statement."""
-        return None if isinstance(node.value, ast.Constant) else node
+    """Lines of a module without comments, docstrings and blank ones: the same in every Python."""
+    lines = text.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column]
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            assert node.end_lineno is not None
+            for row in range(node.lineno - 1, node.end_lineno):
+                lines[row] = ""
+    return "\n".join(line.rstrip() for line in lines if line.strip())

@@ -381,6 +381,13 @@ def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectG
     )
 
 
+def _are_paired(row: Row, other: Row) -> bool:
+    """Whether two rows are of the same episodes."""
+    if row.in_air is not None or row.object_names != other.object_names:
+        return False
+    return row.successes.shape == other.successes.shape
+
+
 def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str, str]]:
     """A line for each entry and policy: what it changes, and how much success it costs."""
     row_of: dict[tuple[str, str], Row] = {}
@@ -395,10 +402,9 @@ def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str
                 continue
             row = row_of[entry.name, policy]
             change = NOTHING
-            if entry.name != first and (first, policy) in row_of and row.in_air is None:
-                nominal = row_of[first, policy]
-                difference = paired_difference(row.successes, nominal.successes)
-                change = points(difference)
+            nominal = row_of.get((first, policy))
+            if entry.name != first and nominal is not None and _are_paired(row, nominal):
+                change = points(paired_difference(row.successes, nominal.successes))
             table.append(
                 {
                     "condition": entry.name,
