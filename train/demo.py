@@ -217,14 +217,10 @@ class Demo:
         from vd.evaluate.result import Result
 
         row = next(row for row in Result.read(part.folder / "eval.json").rows if row.headline)
-        tolerance = str(PAPER.success.rotation_rad)
         lines = []
         for summary in (*row.per_object, row.overall):
-            rates = (
-                summary.success[tolerance],
-                summary.symmetric,
-                summary.outcomes["object falls"],
-            )
+            outcomes = summary.outcomes
+            rates = (outcomes["success"], summary.symmetric, outcomes["object falls"])
             lines.append((summary.name, summary.episodes, *map(percent, rates)))
         return {
             "policy": self.policy,
@@ -233,7 +229,7 @@ class Demo:
             "built_in": len(self.objects) > 1 or self.cfg.meshes is None,
             "film": film,
             "rows": lines,
-            "tolerance_rad": tolerance,
+            "tolerance_rad": PAPER.success.rotation_rad,
             "page": f"{part.name}/eval.html",
         }
 

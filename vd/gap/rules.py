@@ -130,7 +130,8 @@ another. Of an addition, half turns none of 41 joints, twice turns one."""
 PENALTY = 0.01
 """Relative error that a further effect, and each of its parameters, must earn. And what a model must
 leave more than one with white residuals, in squared noise floors, to be worse: thousands of samples
-carry that difference. Half and twice turn none of 41 joints."""
+carry that difference. Half turns none of 41 joints; twice was tried for the first use alone, and
+turns none."""
 FEW = 5
 """Folds below which each motion stands for itself in intervals. Not tuned."""
 RECOVERED = 0.5
