@@ -56,7 +56,7 @@ class HandImport:
     """Folder to write to; by default one of the asset cache, named after the hand."""
     bowl: bool = True
     """Choose the start pose of a palm that looks up, where none is described: dropped cubes stay in
-    it. It takes a minute."""
+    it. It takes one or two minutes."""
 
     def run(self) -> int:
         """Import a hand."""

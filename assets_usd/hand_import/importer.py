@@ -41,7 +41,7 @@ BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
 BENDS = (0.1, 0.2, 0.3, 0.4)
 """By which all fingers are bent (:func:`vd.assets_usd.hand_import.guess.bent`), and then
-BEND_STEP more or less, one after the other: outer ones are walls. Chosen to take a minute.
+BEND_STEP more or less, one after the other: outer ones are walls. Chosen to take one or two minutes.
 """
 BEND_STEP = 0.2
 ANGLE_DIGITS = 2
