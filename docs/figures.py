@@ -67,7 +67,7 @@ def run(name: str, flags: argparse.Namespace) -> int:
 def _run_command(entry: dict[str, str], out: Path, flags: argparse.Namespace) -> int:
     """Measure by a command that writes JSON, unless this code has; the exit status."""
     path = out / f"{entry['name']}.json"
-    code = _code_of(entry["command"])
+    code = _code_of_command(entry["command"])
     if path.is_file() and json.loads(path.read_text())["code"] == code:
         return 0
     given = dict(item.split("=", 1) for item in flags.objects)
@@ -83,7 +83,7 @@ def _run_command(entry: dict[str, str], out: Path, flags: argparse.Namespace) ->
     return subprocess.run([sys.executable, "-m", module, *words]).returncode
 
 
-def _code_of(command: str) -> str:
+def _code_of_command(command: str) -> str:
     """The fingerprint of the code that decides what a command gives."""
     return code_fingerprint(GAP if command.startswith("vd-bench gap") else MEASURING)
 
@@ -117,7 +117,7 @@ def _evaluated(settings: Path) -> dict[str, Any]:
 def is_stale(name: str, figure: dict[str, Any]) -> bool:
     """Whether the policy or the code that measures is another since, or is not known."""
     line, _, policy = name.rpartition("/")
-    code = code_of(policy) if line else _code_of(figure.get("command", ""))
+    code = code_of(policy) if line else _code_of_command(figure.get("command", ""))
     if figure.get("code") != code:
         return True
     return bool(line) and figure["policy"] != fingerprint(policy)

@@ -444,9 +444,9 @@ def test_a_twin_that_is_told_to_freeze_stays_where_it_is(twin, turned, hand):
 
 
 def test_check_of_a_twin_looks_at_its_camera(capsys):
-    assert cli.main(["check", "--twin"]) == 0
+    assert cli.main(["check", "--twin", "--wiggle", "--yes"]) == 0
     said = capsys.readouterr().out
-    assert "camera depth" in said
+    assert "camera depth" in said and said.count("ok     wiggle of") == 9
 
 
 def test_a_twin_that_cannot_be_says_why(capsys):

@@ -176,6 +176,7 @@ def test_code_is_known_by_its_statements(tmp_path, monkeypatch):
         first = digest("x = 1\n")
         assert digest('"""What it is."""\n\n# why\nx = 1  # because\n') == first
         assert digest("x = 2\n") != first
+        assert digest('x = "#1"\n') != digest('x = "#2"\n'), "no comment"
         (tmp_path / "page.py").write_text("y = 1\n")
         assert digest("x = 1\n") == first, "what shows a result does not measure it"
         (tmp_path / "shown" / "sheet.py").write_text("y = 1\n")

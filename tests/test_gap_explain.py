@@ -167,7 +167,9 @@ def test_an_acceleration_limit_that_cannot_follow_is_named(tmp_path: Path) -> No
     report = analysed(recording, tmp_path / "gap", effects=tried)
     assert report.verdict == "effects" and named(report) == {"acceleration_limit"}
     (estimate,) = report.effects[0].parameters.values()
-    assert estimate.value == pytest.approx(10.0, rel=0.1)
+    low, high = estimate.ci95
+    assert low < 10.0 < high
+    assert estimate.value == pytest.approx(10.0, rel=0.02)  # seven seeds: 0.02 to 1.05 % off
 
 
 def test_delays_that_vary_are_unknown(tmp_path: Path) -> None:
