@@ -1,5 +1,6 @@
 """Whole analyses of small recordings: what is missing is named, or left open."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -122,6 +123,18 @@ def test_nothing_hidden_is_no_gap(tmp_path: Path) -> None:
     report = analysed(recorded({}), tmp_path)
     assert report.verdict == "no_gap" and not report.effects and not report.ambiguous
     assert np.isfinite(Predictions.read(tmp_path / "predictions.npz").identified).all()
+
+
+def test_progress_counts_what_is_done_and_shows_no_share_of_what_nobody_knows(
+    tmp_path: Path,
+) -> None:
+    lines: list[str] = []
+    recording = recorded({servo.COULOMB_TORQUE: 0.05})
+    analysed(recording, tmp_path, effects=("coulomb_friction",), progress=lines.append)
+    assert lines[0].startswith("find: j (1 of 1): baseline") and "%" not in "".join(lines)
+    tasks = re.findall(r"explain: j \(1 of 1\): tasks (\d+) to (\d+)", "\n".join(lines))
+    firsts, lasts = zip(*[map(int, pair) for pair in tasks], strict=True)
+    assert len(tasks) > 2 and firsts == (1, *[last + 1 for last in lasts[:-1]])
 
 
 def test_from_the_identified_model_on_there_is_no_gap(tmp_path: Path) -> None:
