@@ -13,7 +13,7 @@ from vd.gap.bench.hidden_plant import COGGING, OUTSIDE
 from vd.gap.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.result import Predictions, Report
-from vd.gap.words import verdict_sentence
+from vd.gap.words import verdict_sentence, without_one
 from vd.gap.workflow import explain
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.recording import Recording
@@ -67,7 +67,7 @@ def test_two_causes_are_found_together(tmp_path: Path) -> None:
     report = analysed(recorded(causes), tmp_path, effects=effects)
     assert named(report) == {"coulomb_friction", "gravity_load"}
     # Each has its own credit, and neither that of both.
-    credits = {row.effect: row.without_rmse_rad for row in report.credits}
+    credits = {effect: model.rmse_rad for _, effect, model in without_one(report)}
     assert {*credits} == named(report)
     assert all(error > 2.0 * report.identified.rmse_rad for error in credits.values())
     assert sum(model.effects == () for model in report.compared) == 1
