@@ -39,11 +39,13 @@ def test_what_is_hidden_is_named_and_what_was_not_recorded_is_unknown(analysis: 
     assert report["verdict"] == "effects"
     assert {effect["name"] for effect in report["effects"]} == {
         "table_friction",
+        "restitution",
         "mass",
         "centre_of_mass",
     }
     found = report["parameters"]
     assert found["table_friction"]["value"][0] == pytest.approx(0.4, abs=0.03)
+    assert found["restitution"]["value"][0] == pytest.approx(0.5, rel=0.1)
     assert found["mass"]["value"][0] == pytest.approx(0.2, rel=0.05)
     np.testing.assert_allclose(found["centre_of_mass"]["value"], [0.01, 0.0, 0.0], atol=2e-3)
     assert found["tip_compliance"]["verdict"] == "unknown"
@@ -63,7 +65,7 @@ def test_the_layer_is_the_object_with_what_was_identified(analysis: Path):
     np.testing.assert_allclose(
         item.inertia / item.mass_kg, plain.inertia / plain.mass_kg, rtol=1e-5
     )
-    assert set(item.contact) == {"table_friction", "mass", "centre_of_mass"}
+    assert set(item.contact) == {"table_friction", "restitution", "mass", "centre_of_mass"}
     again = read_object(write_object(analysis / "again.usd", item))
     assert again.contact == item.contact
     torn = path.with_name("torn.usda")
