@@ -151,7 +151,7 @@ class _JointAnalysis:
         options: How to analyse.
         name: Name of the joint.
         place: Name and number of the joint, in words.
-        asked: Calls that were made. How many there will be is not known.
+        done: Calls that were answered. How many there will be is not known.
     """
 
     pool: WorkerPool
@@ -160,14 +160,14 @@ class _JointAnalysis:
     options: Options
     name: str
     place: str
-    asked: int = 0
+    done: int = 0
 
     def ask(self, calls: Sequence[FitCall]) -> list[Any]:
         """Results of calls of the joint's problem, with a line of progress."""
-        first = self.asked + 1
-        self.asked += len(calls)
-        self.options.progress(f"explain: {self.place}: tasks {first} to {self.asked}")
-        return self.pool.run(self.spec, calls)
+        result = self.pool.run(self.spec, calls)
+        self.done += len(calls)
+        self.options.progress(f"explain: {self.place}: {self.done} tasks done")
+        return result
 
     def run(self, rows: np.ndarray, others: Sequence[AnalysedJoint]) -> AnalysedJoint:
         """Fit the ladder of the joint, and conclude.
