@@ -185,7 +185,7 @@ def without_one(report: Report) -> list[tuple[str, str, WholeModel]]:
     for model in report.compared:
         left_out = held.get(model.joint, set()).difference(model.effects)
         if len(left_out) == 1 and len(model.effects) == len(held[model.joint]) - 1:
-            rows.append((model.joint, *left_out, model))
+            rows.append((model.joint, left_out.pop(), model))
     return rows
 
 
