@@ -114,6 +114,7 @@ def _joint(
                 "rms_rad": _rms(left),
                 "mean_rad": float(np.mean(left)),
                 "along_motion_rad": float(np.mean(left * direction)),
+                "noise_floor_rad": floor,
             }
             rows.append(Misfit(name, f"{name}: {when} the joint {_does(signature)}", signature))
     return sorted(rows, key=lambda row: -row.signature["rms_rad"])[:2]
