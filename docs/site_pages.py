@@ -16,6 +16,7 @@ import sys
 import textwrap
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -140,9 +141,9 @@ def _documented(name: str, thing: Any) -> str:
     return f"```text\n{shown}\n\n{textwrap.indent(text, '    ')}\n```"
 
 
-def own_terms() -> str:
-    """The example of own terms."""
-    return f"```python\n{(ROOT / 'examples/own_terms.py').read_text()}```"
+def example(name: str) -> str:
+    """One of the examples."""
+    return f"```python\n{(ROOT / f'examples/{name}.py').read_text()}```"
 
 
 def constants() -> str:
@@ -231,7 +232,8 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 GENERATED = {
     "observation": observation,
     "names": names,
-    "own_terms": own_terms,
+    "own_terms": partial(example, "own_terms"),
+    "contact": partial(example, "contact"),
     "commands": commands,
     "constants": constants,
     "effects": effects,

@@ -8,7 +8,6 @@ from vd.gap.bench.hide import Hiding, hide
 from vd.gap.chain import chains
 from vd.gap.result import (
     AnalysedRecording,
-    Credit,
     Delivered,
     Estimate,
     FamilyVerdict,
@@ -109,7 +108,6 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
         families=tuple(families),
         models=tuple(each for each in models if not each.why),
         compared=models,
-        credits=(Credit(JOINT, "coulomb_friction", before, before),),
         not_tried={JOINT: {"supply_sag": "the recorded voltage falls too little"}},
         aside={JOINT: curves.files[-1]},
         delivered=Delivered(curves.files[-1], after, before),

@@ -1,7 +1,6 @@
 """Recordings of the hidden plant: they hide what they hide, and are what the hidden machine did."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,9 +14,6 @@ from vd.gap.bench.hide import (
     simulate_hidden,
     truth_path,
 )
-from vd.gap.chain import chains
-from vd.gap.rules import contradicted, late_side
-from vd.gap.telemetry import telemetry_of
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.excitations import MENU, JointRange, excitation_set
 from vd.logs.recording import read_recording
@@ -42,28 +38,6 @@ def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     counts = trajectory.position / ENCODER_COUNT
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-2)
     assert 0.5e-3 < np.diff(trajectory.time).std() < 2.5e-3
-
-
-@pytest.mark.parametrize("late", ["command_delay", "read_delay"])
-def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path):
-    hide(Hiding("servo", {late: {"delay_s": 0.03}}, seed=6, pwm=True), tmp_path / "r")
-    recording = read_recording(tmp_path / "r")
-    (chain,) = chains(recording)
-    everything = tuple(range(len(recording.trajectories)))
-    other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
-    telemetry = telemetry_of(recording, chain, 0, everything)
-    assert late_side(telemetry) == late
-    refused = set(contradicted(telemetry))
-    assert {
-        other,
-        "command_filter",
-        "dead_zone",
-        "backlash",
-    } <= refused and late not in refused
-    silent = replace(
-        recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories)
-    )
-    assert late_side(telemetry_of(silent, chain, 0, everything)) == ""
 
 
 def test_seeds_repeat_and_differ():

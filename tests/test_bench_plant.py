@@ -53,7 +53,7 @@ def answer(
     time = np.arange(int(duration * rate) + 1) / rate
     values = np.stack([np.broadcast_to(command(time), time.shape)] * len(plant.joints), axis=1)
     enabled = run.pop("enabled", np.ones(values.shape, dtype=bool))
-    return time, simulate([PlantRun(plant, time, values, enabled, **run)], dt=dt)[0].position
+    return time, simulate([PlantRun(plant, time, values, enabled, **run)], dt=dt)[0]
 
 
 def step(time):
@@ -93,7 +93,7 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect():
     for name, parameters in sizes.items():
         measured = []
         for motion in motions:
-            position = np.round(next(moved).position / ENCODER_COUNT) * ENCODER_COUNT
+            position = np.round(next(moved) / ENCODER_COUNT) * ENCODER_COUNT
             measured.append(replace(motion, position=position))
         recording = replace(made.recording, trajectories=tuple(measured))
         (chain,) = chains(recording)
@@ -176,8 +176,8 @@ def test_a_finger_moves_as_by_the_steps_of_another_integrator(payload):
     off = np.zeros((100, 3), dtype=bool)
     conditions = {"payload_kg": payload}
     (moved,) = simulate([PlantRun(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
-    assert np.ptp(moved.position, axis=0).min() > 0.1
-    np.testing.assert_allclose(moved.position, np.array(expected), atol=2e-3)
+    assert np.ptp(moved, axis=0).min() > 0.1
+    np.testing.assert_allclose(moved, np.array(expected), atol=2e-3)
 
 
 def test_a_finger_of_any_hand_moves_as_the_rollouts_say(tmp_path, monkeypatch):

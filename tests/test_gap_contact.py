@@ -3,8 +3,10 @@
 Bad input refused.
 """
 
+import contextlib
 import csv
 import json
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,22 +17,20 @@ from vd.assets_usd.objects.model import ObjectError, read_object, write_object
 from vd.assets_usd.objects.sets import load_set, set_files
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.gap.bench.hidden_contact import ContactPlant, hide_contact
 from vd.gap.cli import main
 from vd.sim.scene import SHAPE_TABLE
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "contact.py"
 
 
 @pytest.fixture(scope="module")
 def analysis(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder: the recording ``rec`` of a slippery, heavy cube whose centre is off, its analysis ``out``."""
+    """A folder: the example's slippery, heavy cube whose centre is off, and its analysis ``out``."""
     folder = tmp_path_factory.mktemp("contact")
-    hidden = {"table_friction": 0.4, "mass": 0.2, "centre_of_mass": (0.01, 0.0, 0.0)}
-    plant = ContactPlant(load_set("cube")[0], hidden, seed=3)
-    hide_contact(plant, folder / "rec", {"drop": 12, "slide": 5, "push": 5})
-    file = str(set_files(["cube"])[0])
-    assert (
-        main(["contact", str(folder / "rec"), "--object", file, "--out", str(folder / "out")]) == 0
-    )
+    with contextlib.chdir(folder):
+        runpy.run_path(str(EXAMPLE))
+        file = str(set_files(["cube"])[0])
+        assert main(["contact", "rec-cube", "--object", file, "--out", "out"]) == 0
     return folder
 
 
@@ -39,11 +39,13 @@ def test_what_is_hidden_is_named_and_what_was_not_recorded_is_unknown(analysis: 
     assert report["verdict"] == "effects"
     assert {effect["name"] for effect in report["effects"]} == {
         "table_friction",
+        "restitution",
         "mass",
         "centre_of_mass",
     }
     found = report["parameters"]
     assert found["table_friction"]["value"][0] == pytest.approx(0.4, abs=0.03)
+    assert found["restitution"]["value"][0] == pytest.approx(0.5, rel=0.1)
     assert found["mass"]["value"][0] == pytest.approx(0.2, rel=0.05)
     np.testing.assert_allclose(found["centre_of_mass"]["value"], [0.01, 0.0, 0.0], atol=2e-3)
     assert found["tip_compliance"]["verdict"] == "unknown"
@@ -52,7 +54,7 @@ def test_what_is_hidden_is_named_and_what_was_not_recorded_is_unknown(analysis: 
 
 def test_commands_for_joints_send_a_recording_of_an_object_to_its_own(analysis: Path, capsys):
     for command in ("run", "plan"):
-        assert main([command, str(analysis / "rec"), "--out", str(analysis / "joints")]) == 2
+        assert main([command, str(analysis / "rec-cube"), "--out", str(analysis / "joints")]) == 2
         assert "vd-gap contact" in capsys.readouterr().err
 
 
@@ -63,7 +65,7 @@ def test_the_layer_is_the_object_with_what_was_identified(analysis: Path):
     np.testing.assert_allclose(
         item.inertia / item.mass_kg, plain.inertia / plain.mass_kg, rtol=1e-5
     )
-    assert set(item.contact) == {"table_friction", "mass", "centre_of_mass"}
+    assert set(item.contact) == {"table_friction", "restitution", "mass", "centre_of_mass"}
     again = read_object(write_object(analysis / "again.usd", item))
     assert again.contact == item.contact
     torn = path.with_name("torn.usda")
@@ -127,7 +129,7 @@ def test_the_task_has_the_identified_contact_and_varies_it_within_its_interval(
 def test_a_recording_that_cannot_be_used_is_refused(
     analysis: Path, tmp_path: Path, capsys, file, change, message
 ):
-    for path in (analysis / "rec").iterdir():
+    for path in (analysis / "rec-cube").iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     header, *rows = csv.reader((tmp_path / file).open())
     changed = change(rows)

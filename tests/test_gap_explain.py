@@ -1,5 +1,6 @@
 """Whole analyses of small recordings: what is missing is named, or left open."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from vd.gap.bench.hidden_plant import COGGING, OUTSIDE
 from vd.gap.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.result import Predictions, Report
-from vd.gap.words import verdict_sentence
+from vd.gap.words import verdict_sentence, without_one
 from vd.gap.workflow import explain
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.recording import Recording
@@ -66,7 +67,7 @@ def test_two_causes_are_found_together(tmp_path: Path) -> None:
     report = analysed(recorded(causes), tmp_path, effects=effects)
     assert named(report) == {"coulomb_friction", "gravity_load"}
     # Each has its own credit, and neither that of both.
-    credits = {row.effect: row.without_rmse_rad for row in report.credits}
+    credits = {effect: model.rmse_rad for _, effect, model in without_one(report)}
     assert {*credits} == named(report)
     assert all(error > 2.0 * report.identified.rmse_rad for error in credits.values())
     assert sum(model.effects == () for model in report.compared) == 1
@@ -122,6 +123,17 @@ def test_nothing_hidden_is_no_gap(tmp_path: Path) -> None:
     report = analysed(recorded({}), tmp_path)
     assert report.verdict == "no_gap" and not report.effects and not report.ambiguous
     assert np.isfinite(Predictions.read(tmp_path / "predictions.npz").identified).all()
+
+
+def test_progress_counts_what_is_done_and_shows_no_share_of_what_nobody_knows(
+    tmp_path: Path,
+) -> None:
+    lines: list[str] = []
+    recording = recorded({servo.COULOMB_TORQUE: 0.05})
+    analysed(recording, tmp_path, effects=("coulomb_friction",), progress=lines.append)
+    assert lines[0].startswith("find: j (1 of 1): baseline") and "%" not in "".join(lines)
+    done = re.findall(r"explain: j \(1 of 1\): (\d+) tasks done", "\n".join(lines))
+    assert len(done) > 2 and sorted({*map(int, done)}) == [*map(int, done)]
 
 
 def test_from_the_identified_model_on_there_is_no_gap(tmp_path: Path) -> None:

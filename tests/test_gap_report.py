@@ -15,7 +15,6 @@ from vd.gap.report import write_report
 from vd.gap.result import (
     Alternative,
     Closing,
-    Credit,
     Delivered,
     HeldOut,
     Misfit,
@@ -208,11 +207,13 @@ def test_an_error_that_rises_is_not_said_to_fall(report):
 def test_credit_is_shared_between_the_effects_that_earn_it(report):
     friction = report.effects[0]
     saturation = dataclasses.replace(friction, name="torque_saturation")
-    credits = (
-        Credit(JOINT, "coulomb_friction", 0.081, 0.094),
-        Credit(JOINT, "torque_saturation", 0.042, 0.065),
+    compared = (
+        model(("coulomb_friction", "torque_saturation"), {}, 0.031),
+        model(("torque_saturation",), {}, 0.094),
+        model(("coulomb_friction",), {}, 0.065),
+        model(("backlash",), {}, 0.033),
     )
-    text = outcome(report, effects=(friction,), provisional=(saturation,), credits=credits)
+    text = outcome(report, effects=(friction,), provisional=(saturation,), compared=compared)
     assert "coulomb friction and torque saturation" in text
     assert "94 mrad without coulomb friction and 65 mrad without torque saturation" in text
 

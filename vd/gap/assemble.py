@@ -15,7 +15,6 @@ from vd.gap.fit import FINER, JointFit, JointSpec, Problems, intervals
 from vd.gap.result import (
     Alternative,
     AnalysedRecording,
-    Credit,
     Estimate,
     FamilyVerdict,
     FittedModel,
@@ -30,10 +29,9 @@ from vd.gap.result import (
 )
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
+from vd.gap.words import LISTED
 from vd.logs.recording import Recording
 
-LISTED = 5
-"""Good models of a joint that a report lists at most: the contract's."""
 ANSWERS = ("effects", "ambiguous")
 """Verdicts that name something."""
 
@@ -113,7 +111,6 @@ def assemble(
     families: list[FamilyVerdict] = []
     models: list[WholeModel] = []
     compared: list[WholeModel] = []
-    credits: list[Credit] = []
     not_tried: dict[str, dict[str, str]] = {}
     aside: dict[str, str] = {}
     for joint in joints:
@@ -130,7 +127,6 @@ def assemble(
         every = _models(joint)
         models += every[: min(LISTED, len(joint.conclusion.good))]
         compared += every
-        credits += _credits(joint)
         not_tried[joint.name] = dict(joint.vetoes)
         if joint.spec.aside is not None:
             aside[joint.name] = recording.trajectories[joint.spec.aside].file
@@ -163,11 +159,9 @@ def assemble(
         families=tuple(families),
         models=tuple(models),
         compared=tuple(compared),
-        credits=tuple(credits),
         not_tried=not_tried,
         trajectories=tuple(errors),
         aside=aside,
-        seed=seed,
     )
     return report, predictions
 
@@ -358,13 +352,3 @@ def _models(joint: AnalysedJoint) -> list[WholeModel]:
             )
         )
     return rows
-
-
-def _credits(joint: AnalysedJoint) -> list[Credit]:
-    """What each effect of a joint's delivered model brings, where the model without it was fitted."""
-    rows = []
-    for fit in joint.fits:
-        left_out = {*joint.final.effects}.difference(fit.effects)
-        if len(left_out) == 1 and len(fit.effects) == len(joint.final.effects) - 1:
-            rows.append(Credit(joint.name, left_out.pop(), fit.rmse, fit.held_out_rmse))
-    return sorted(rows, key=lambda row: joint.final.effects.index(row.effect))

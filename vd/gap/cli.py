@@ -154,8 +154,6 @@ class HideCommand:
     """Sets of motions."""
     seed: int = 0
     """Seed of everything random."""
-    pwm: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Record the duty cycle as well, which tells a late command from a late reading."""
 
     def run(self) -> int:
         """Write the recording."""
@@ -163,7 +161,7 @@ class HideCommand:
 
         check_hidden(self.out)
         effects = dict(map(parse_effect, self.effect))
-        hiding = Hiding(self.model, effects, self.seed, excitations=self.excitations, pwm=self.pwm)
+        hiding = Hiding(self.model, effects, self.seed, excitations=self.excitations)
         count = len(hide(hiding, self.out).recording.trajectories)
         print(f"{self.out}: {count} motions\n{truth_path(self.out)}")
         return 0

@@ -6,7 +6,7 @@ least squares to every motion that obeys it:
 
 - ``table_friction`` mu: a sliding object slows down by mu g, its path is s0 + v t - mu g t^2 / 2.
 - ``centre_of_mass`` d: in flight o(t) + R(t) d is on a parabola, o the object's origin.
-- ``restitution`` e: the point that hits the table leaves with e times the speed it came with.
+- ``restitution`` e: a face that hits the table leaves with e times the speed it came with.
 - ``mass`` m: while a pushed object slides, the impulse of the push is m (change of velocity + mu g
   time).
 - ``tip_compliance`` c: the rigid part of a pressing finger comes nearer by c times the force.
@@ -29,6 +29,7 @@ from scipy.stats import t as student
 from vd.assets_usd.objects.contact_layer import CONTACT, contact_of
 from vd.assets_usd.objects.model import ObjectModel
 from vd.gap.chain import GRAVITY_M_S2
+from vd.gap.statistics import SMOOTH_S
 from vd.logs.contact_recording import ContactMotion, ContactRecording, Kind
 from vd.logs.recording_checks import RecordingError
 
@@ -42,11 +43,9 @@ OUTLIER = 3.5
 """Residuals beyond this many standard deviations, by the median, are samples that came late."""
 FEWEST = 5
 """Samples below which a stretch of a motion is no evidence; motions: three."""
-SMOOTH_S = 0.05
-"""Window of the parabola that gives velocities [s]."""
 CLEAR_M = 0.003
-"""An object flies if its lowest point is this far above the table: more than a tracker errs by
-[m].
+"""An object flies if its lowest point is this far above the table, and points this close to the
+lowest one hit it with that: more than a tracker errs by [m].
 """
 SURE_S = 0.15
 """Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
@@ -58,10 +57,6 @@ TURNING = 0.3
 """Speed of the rim by turning over that of the object below which friction is against the motion,
 to 2 %.
 """
-FLAT_M = 0.003
-"""Points this close to the lowest one hit the table with it [m]."""
-IMPACT_S = 0.01
-"""Longest impact: a rubber ball on wood takes half [s]."""
 PRESSED_N = 0.2
 """Force above which a finger touches: ten times the noise of a cheap load cell."""
 
@@ -370,7 +365,10 @@ def _flat_on_table(motion: ContactMotion, state: _State) -> np.ndarray:
 
 
 def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
-    """Speed of the touching points after an impact = e times before."""
+    """Speed of the touching points after an impact = e times before.
+
+    Of a face: an edge or a corner hits off the centre, and turns the object instead.
+    """
     flights = _in_flight(motion, state)
     # Of the fastest bounce with too few samples above CLEAR_M.
     fall = 0.5 * GRAVITY_M_S2 * (0.5 * FEWEST * _step(motion)) ** 2
@@ -378,23 +376,22 @@ def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
             return
-        come, falling, touching = _touch(motion, before, state, None)
+        falling, touching = _touch(motion, before, state, None)
+        if touching.sum() < 3:
+            continue
         rising = state.unseen * unseen
         if after is not None:
-            leave, rising, _ = _touch(motion, after, state, touching)
-            if not -0.2 * IMPACT_S < leave - come < IMPACT_S:
-                continue  # another point hit the table in between
+            rising, _ = _touch(motion, after, state, touching)
         yield np.array([[falling**2]]), np.array([-falling * rising])
 
 
 def _touch(
     motion: ContactMotion, part: slice, state: _State, touching: np.ndarray | None
-) -> tuple[float, float, np.ndarray]:
+) -> tuple[float, np.ndarray]:
     """Where a flight meets the table: at its end, or at its begin for given points [N] bool.
 
     Returns:
-        When [s]; how fast the points that touch it rise then [m/s]; which points they are, [N]
-        bool.
+        How fast the points that touch it rise then [m/s]; which points they are, [N] bool.
     """
     time = motion.time[part]
     edge = -1 if touching is None else 0
@@ -411,11 +408,11 @@ def _touch(
     above = height + rise * times - 0.5 * GRAVITY_M_S2 * times**2 - state.table_m
     if touching is None:
         first = arms[np.abs(above + arms[:, 2].min(1)).argmin(), 2]
-        touching = first < first.min() + FLAT_M
+        touching = first < first.min() + CLEAR_M
     arms = arms[:, :, touching].mean(2)
     at = np.abs(above + arms[:, 2]).argmin()
     speed = rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arms[at])[2]
-    return time[edge] + times[at], speed, touching
+    return speed, touching
 
 
 def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:

@@ -114,8 +114,6 @@ def _joint(
                 "rms_rad": _rms(left),
                 "mean_rad": float(np.mean(left)),
                 "along_motion_rad": float(np.mean(left * direction)),
-                "share_of_time": float(mask.mean()),
-                "overall_rms_rad": _rms(residual),
                 "noise_floor_rad": floor,
             }
             rows.append(Misfit(name, f"{name}: {when} the joint {_does(signature)}", signature))

@@ -11,7 +11,6 @@ from vd.command.page import FIGURE_DPI, write_html
 from vd.gap import figures, words
 from vd.gap.coordinates import PARAMETERS
 from vd.gap.result import (
-    Credit,
     FamilyVerdict,
     JointGap,
     NamedEffect,
@@ -83,7 +82,6 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         families=[*map(_family_row, report.families)],
         models=[*map(_model_row, report.models)],
         compared=[*map(_model_row, report.compared)],
-        credits=[_credit_row(report, row) for row in report.credits],
         not_tried=_not_tried(report),
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
         model=_model(report),
@@ -161,17 +159,6 @@ def _model_row(row: WholeModel) -> Row:
         words.mrad_range(row.difference_ci95),
         plain(row.why) or "as good as the best",
         ", ".join(values),
-    )
-
-
-def _credit_row(report: Report, row: Credit) -> Row:
-    (joint,) = [each for each in report.joints if each.joint == row.joint]
-    fitted = report.identified.per_joint[row.joint]
-    return (
-        row.joint,
-        plain(row.effect),
-        f"{mrad(fitted)} with it, {mrad(row.without_rmse_rad)} without",
-        f"{mrad(joint.identified_rmse_rad)} with it, {mrad(row.without_held_out_rmse_rad)} without",
     )
 
 

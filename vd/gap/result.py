@@ -158,16 +158,6 @@ class WholeModel:
 
 
 @dataclass(frozen=True)
-class Credit:
-    """What one effect of the identified model brings: the errors of the model without it, refitted."""
-
-    joint: str
-    effect: str
-    without_rmse_rad: float
-    without_held_out_rmse_rad: float
-
-
-@dataclass(frozen=True)
 class Delivered:
     """The layer as it was written, simulated on motions that no fit saw."""
 
@@ -261,7 +251,6 @@ class Report:
     """The models of each joint that are not worse than its best, the best first, at most five."""
     compared: tuple[WholeModel, ...] = ()
     """All models that were fitted."""
-    credits: tuple[Credit, ...] = ()
     not_tried: dict[str, dict[str, str]] = field(default_factory=dict)
     """Effects that no model has, with the reason, by joint."""
     aside: dict[str, str] = field(default_factory=dict)
@@ -271,7 +260,6 @@ class Report:
     closing: Closing | None = None
     warnings: tuple[str, ...] = ()
     """What a reader should know about the data or the fit, in plain sentences."""
-    seed: int = 0
     command: str = ""
     """Command that repeats the analysis."""
     software: dict[str, str] = field(default_factory=dict)

@@ -118,9 +118,6 @@ LINEAR = 0.995
 """Share of the duty cycle's variance that the plain error must explain for it to be linear. Not
 tuned.
 """
-CLEARER = 4.0
-"""How many times more of the duty cycle the wrong delay must leave than the right one: a read delay
-leaves 0.5 % on either side. Not tuned."""
 NO_GAP = 1.15
 """A model within this factor of the noise floor leaves white residuals, and nothing to explain.
 Half of what it leaves above 1 turns none of 41 joints, twice turns five."""
@@ -213,35 +210,11 @@ def contradicted(telemetry: Telemetry) -> dict[str, str]:
             f"the recorded voltage falls by {fall:.2f} V of {idle:.1f} V at full pull, "
             "too little for sag"
         )
-    late = late_side(telemetry)
-    if late:
-        reason = f"the recorded duty cycle follows the error with a {late.replace('_', ' ')} alone"
-    elif telemetry.follows >= LINEAR:
+    if telemetry.follows >= LINEAR:
         share = f"{100.0 * telemetry.follows:.1f} % of it"
         reason = f"the recorded duty cycle follows the plain error ({share}): it acts downstream"
-    else:
-        return result
-    result |= dict.fromkeys(UPSTREAM, reason)
-    result.pop(late, None)
+        result |= dict.fromkeys(UPSTREAM, reason)
     return result
-
-
-def late_side(telemetry: Telemetry) -> str:
-    """Which of command and reading is late, if the recorded duty cycle says so.
-
-    Positions alone cannot tell (:data:`vd.kernels.servo.effects.EQUIVALENT`). The duty cycle
-    follows the late command less the position there is, or the command there is less the position
-    that is reported later.
-
-    Returns:
-        ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is
-        recorded.
-    """
-    ranked = sorted(telemetry.late.items(), key=lambda item: item[1][1])
-    (side, (lag, left)), (_, (_, other)) = ranked
-    # Registers read one after the other are less than a sample apart: that is nobody's delay.
-    clear = left < 1.0 - LINEAR and CLEARER * left < other
-    return side if lag >= telemetry.sample_s and clear else ""
 
 
 def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[str]]:

@@ -45,7 +45,7 @@ _DOES = {
     "close": "writing the identified model and simulating the commands again",
     "report": "drawing the page",
 }
-METHOD = 20
+METHOD = 21
 """Version of the analysis; what another one made is made again."""
 NO_EFFECTS = "none"
 """In place of candidates: identify the drives alone."""

@@ -1,13 +1,11 @@
 """What recorded voltage and duty cycle say of a joint; :mod:`vd.gap.rules` says what that rules out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from vd.gap.chain import Chain
-from vd.gap.rollout import STEP_S
-from vd.kernels.servo.effects import EFFECTS
 from vd.logs.motions import Recording, Trajectory
 from vd.logs.recording_checks import MIN_SAMPLES
 
@@ -20,15 +18,10 @@ class Telemetry:
         fall: How far the voltage falls at full pull, and its value idle [V]; None where too little
             is recorded.
         follows: Share of the duty cycle that follows the plain error; 0 where none is recorded.
-        late: Delay [s] with which it is followed best, and the share that this leaves, if the
-            command is late (``command_delay``) or the reading (``read_delay``).
-        sample_s: Time between two samples [s].
     """
 
     fall: tuple[float, float] | None
     follows: float
-    late: Mapping[str, tuple[float, float]]
-    sample_s: float
 
 
 def telemetry_of(
@@ -44,20 +37,8 @@ def telemetry_of(
     """
     parts = [recording.trajectories[i] for i in trajectories]
     driven = [t for t in parts if chain.joints[joint] in t.joints]
-    (delay,) = EFFECTS["command_delay"].parameters
-    late = {}
-    for side in ("command_delay", "read_delay"):
-        late[side] = (0.0, np.inf)
-        for lag in np.arange(0.0, delay.upper, STEP_S):
-            left = 1.0 - _follows(parts, chain, joint, **{side: lag})
-            if left < late[side][1]:
-                late[side] = (float(lag), left)
-    return Telemetry(
-        fall=_voltage_fall(driven, int(chain.columns[joint])),
-        follows=_follows(driven, chain, joint),
-        late=late,
-        sample_s=float(np.median(np.concatenate([np.diff(t.time) for t in parts]))),
-    )
+    fall = _voltage_fall(driven, int(chain.columns[joint]))
+    return Telemetry(fall, _follows(driven, chain, joint))
 
 
 def _recorded(values: np.ndarray | None, column: int) -> np.ndarray | None:
@@ -66,25 +47,20 @@ def _recorded(values: np.ndarray | None, column: int) -> np.ndarray | None:
     return own if own is not None and np.isfinite(own).all() else None
 
 
-def _follows(
-    trajectories: list[Trajectory],
-    chain: Chain,
-    joint: int,
-    command_delay: float = 0.0,
-    read_delay: float = 0.0,
-) -> float:
-    """Share of a joint's duty cycle that follows the error if command or reading is that late [s]."""
+def _follows(trajectories: list[Trajectory], chain: Chain, joint: int) -> float:
+    """Share of a joint's duty cycle that follows the plain error."""
     pairs = [np.zeros((2, 0))]
     column = chain.columns[joint]
     reference = chain.reference_p_gain
     for t in trajectories:
         duty = _recorded(t.pwm, column)
         if duty is not None:
-            sent = np.maximum(np.searchsorted(t.sent, t.time - command_delay, side="right") - 1, 0)
-            position = np.interp(t.time + read_delay, t.time, t.position[:, column])
+            sent = np.maximum(np.searchsorted(t.sent, t.time, side="right") - 1, 0)
             gain = float(t.conditions.get("p_gain", reference)) / reference if reference else 1.0
             used = t.enabled[:, column] & (np.abs(duty) < 1.0)
-            pairs.append(np.array([gain * (t.command[sent, column] - position), duty])[:, used])
+            pairs.append(
+                np.array([gain * (t.command[sent, column] - t.position[:, column]), duty])[:, used]
+            )
     error, duty = np.concatenate(pairs, axis=1)
     if len(error) < MIN_SAMPLES:
         return 0.0

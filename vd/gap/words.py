@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Sequence
 from typing import get_args
 
-from vd.gap.result import LAYER, Certainty, Estimate, Interval, NamedEffect, Report
+from vd.gap.result import LAYER, Certainty, Estimate, Interval, NamedEffect, Report, WholeModel
 from vd.gap.statistics import REPEATABLE
 
-LISTED = 4
-"""More joints than this are counted rather than listed, and no more curves are drawn than this. Not
-tuned.
+LISTED = 5
+"""More joints than this are counted rather than listed, and no more curves are drawn and good models
+of a joint listed than this: the contract's.
 """
 
 
@@ -164,15 +164,29 @@ def _judged(report: Report) -> str:
 def _credit(report: Report) -> str:
     """What the model leaves without each of several effects, so that none has credit for all."""
     parts: dict[str, list[str]] = {}
-    for row in report.credits:
-        text = f"{mrad(row.without_held_out_rmse_rad)} without {plain(row.effect)}"
-        parts.setdefault(row.joint, []).append(text)
+    for joint, effect, model in without_one(report):
+        text = f"{mrad(model.held_out_rmse_rad)} without {plain(effect)}"
+        parts.setdefault(joint, []).append(text)
     sentences = []
     for joint, each in parts.items():
         if len(each) > 1:
             where = f" on {joint}" if len(report.joints) > 1 else ""
             sentences.append(f" Each has its part{where}: held out it is {listing(each)}.")
     return "".join(sentences) if len(sentences) <= LISTED else ""
+
+
+def without_one(report: Report) -> list[tuple[str, str, WholeModel]]:
+    """Joint and effect of the identified model, and the model without it, where that was fitted."""
+    held: dict[str, set[str]] = {}
+    for effect in (*report.effects, *report.provisional):
+        for joint in effect.joints:
+            held.setdefault(joint, set()).add(effect.name)
+    rows = []
+    for model in report.compared:
+        left_out = held.get(model.joint, set()).difference(model.effects)
+        if len(left_out) == 1 and len(model.effects) == len(held[model.joint]) - 1:
+            rows.append((model.joint, left_out.pop(), model))
+    return rows
 
 
 def _leftover(report: Report) -> str:

@@ -18,8 +18,6 @@ ProblemOf = Callable[[Any], Any]
 """The problem of a joint, by what specifies it."""
 Call = Callable[[Any], Any]
 """What is asked of a problem; it is sent to another process."""
-Done = Callable[[float], None]
-"""Told the share of calls that are done."""
 
 
 def _serve(connection: Connection, problem_of: ProblemOf, parent: int) -> None:
@@ -69,27 +67,22 @@ class WorkerPool:
         for process in self._processes:
             process.kill()
 
-    def run(self, spec: Any, calls: Sequence[Call], done: Done = lambda share: None) -> list[Any]:
+    def run(self, spec: Any, calls: Sequence[Call]) -> list[Any]:
         """Results of the calls, in order.
 
         Args:
             spec: What specifies the problem.
             calls: What is asked of it.
-            done: Called after each.
 
         Raises:
             ChildProcessError: A worker process was killed.
         """
-        results: list[Any] = [None] * len(calls)
         if not self._connections:
-            for index, call in enumerate(calls):
-                results[index] = call(self.problem_of(spec))
-                done((index + 1) / len(calls))
-            return results
+            return [call(self.problem_of(spec)) for call in calls]
+        results: list[Any] = [None] * len(calls)
         waiting = deque(range(len(calls)))
         idle: list[Any] = [*self._connections]
         running: dict[Any, int] = {}
-        finished = 0
         while waiting or running:
             while waiting and idle:
                 connection = idle.pop()
@@ -98,8 +91,6 @@ class WorkerPool:
             for ready in wait(list(running)):
                 results[running.pop(ready)] = self._answer(ready)
                 idle.append(ready)
-                finished += 1
-                done(finished / len(calls))
         return results
 
     def _send(self, connection: Connection, call: Any) -> None:

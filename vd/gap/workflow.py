@@ -125,10 +125,11 @@ def explain(
     analysed: dict[JointSpec, AnalysedJoint] = {}
     with _workers(problems, chosen) as pool:
         # Of each finger from its tip on, as a joint's motion shakes those before it.
-        for number, spec in enumerate(sorted(specs, key=lambda spec: (spec.chain, -spec.joint))):
+        for number, spec in enumerate(sorted(specs, key=lambda spec: (spec.chain, -spec.joint)), 1):
             name = problems.chains[spec.chain].joints[spec.joint]
             rows = np.array(before["joints"][name]["rows"])
-            analysis = _JointAnalysis(pool, problems, spec, chosen, number / len(specs), len(specs))
+            place = f"{name} ({number} of {len(specs)})"
+            analysis = _JointAnalysis(pool, problems, spec, chosen, name, place)
             analysed[spec] = analysis.run(rows, list(analysed.values()))
     misfits = [Misfit(**misfit) for misfit in before["findings"]]
     joints = [*map(analysed.__getitem__, specs)]
@@ -141,45 +142,32 @@ def explain(
 
 @dataclass
 class _JointAnalysis:
-    """What is done with one joint, with the share of the whole that is done.
+    """What is done with one joint.
 
     Attributes:
         pool: Who fits.
         problems: Of the recording.
         spec: Of the joint.
         options: How to analyse.
-        before: Share of the whole that was done before.
-        joints: Number of all joints.
-        stages: Batches of fits that are done.
+        name: Name of the joint.
+        place: Name and number of the joint, in words.
+        done: Calls that were answered. How many there will be is not known.
     """
 
     pool: WorkerPool
     problems: Problems
     spec: JointSpec
     options: Options
-    before: float
-    joints: int
-    stages: int = 0
-    said: int = -1
-
-    @property
-    def name(self) -> str:
-        """Name of the joint."""
-        return self.problems.chains[self.spec.chain].joints[self.spec.joint]
+    name: str
+    place: str
+    done: int = 0
 
     def ask(self, calls: Sequence[FitCall]) -> list[Any]:
-        """Results of calls of the joint's problem, with progress."""
-        result = self.pool.run(self.spec, calls, self.progress)
-        self.stages += 1
+        """Results of calls of the joint's problem, with a line of progress."""
+        result = self.pool.run(self.spec, calls)
+        self.done += len(calls)
+        self.options.progress(f"explain: {self.place}: {self.done} tasks done")
         return result
-
-    def progress(self, share: float) -> None:
-        """Say how much is done, at every tenth of the joint."""
-        done = min((self.stages + share) / STAGES, 1.0)
-        if int(10.0 * done) > self.said:
-            self.said = int(10.0 * done)
-            total = self.before + done / self.joints
-            self.options.progress(f"explain: {100.0 * total:3.0f} % {self.name}")
 
     def run(self, rows: np.ndarray, others: Sequence[AnalysedJoint]) -> AnalysedJoint:
         """Fit the ladder of the joint, and conclude.
@@ -239,10 +227,6 @@ class _JointAnalysis:
         return names, vetoes, {**means, **TOGETHER}
 
 
-STAGES = 12
-"""Batches of fits of a joint at most."""
-
-
 def _workers(problems: Problems, options: Options) -> WorkerPool:
     """Who fits."""
     cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
@@ -297,22 +281,33 @@ def _identify(
     pool: WorkerPool, chains: Sequence[Chain], specs: Sequence[JointSpec], options: Options
 ) -> list[JointFit]:
     """Plain models of all joints; the joints of a chain once more beside the others' plain models."""
-    fits = []
-    for number, spec in enumerate(specs):
-        chain = chains[spec.chain]
-        ((fit, _),) = pool.run(spec, [partial(JointProblem.plain, base=chain.start_row)])
-        fits.append(fit)
-        share = 100.0 * (number + 1) / len(specs)
-        line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
-        options.progress(f"find: {share:3.0f} % {chain.joints[spec.joint]}: {line}")
+    starts = [chains[spec.chain].start_row for spec in specs]
+    fits = _plain(pool, chains, specs, starts, options)
     if not chains[0].bodies:
         return fits
-    again = []
+    beside = []
     for spec, fit in zip(specs, fits, strict=True):
         rows = fit.rows.copy()
-        for other, beside in zip(specs, fits, strict=True):
+        for other, its in zip(specs, fits, strict=True):
             if other.chain == spec.chain:
-                rows[other.joint] = beside.rows[other.joint]
-        ((fit, _),) = pool.run(spec, [partial(JointProblem.plain, base=rows)])
-        again.append(fit)
-    return again
+                rows[other.joint] = its.rows[other.joint]
+        beside.append(rows)
+    return _plain(pool, chains, specs, beside, options)
+
+
+def _plain(
+    pool: WorkerPool,
+    chains: Sequence[Chain],
+    specs: Sequence[JointSpec],
+    bases: Sequence[np.ndarray],
+    options: Options,
+) -> list[JointFit]:
+    """Plain models of joints, each beside the rows of its chain [n, PARAMETER_COLUMNS]."""
+    fits = []
+    for spec, base in zip(specs, bases, strict=True):
+        ((fit, _),) = pool.run(spec, [partial(JointProblem.plain, base=base)])
+        fits.append(fit)
+        name = f"{chains[spec.chain].joints[spec.joint]} ({len(fits)} of {len(specs)})"
+        line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
+        options.progress(f"find: {name}: {line}")
+    return fits

@@ -116,8 +116,6 @@ def run_battery(
     """Run the cases that have no result in the folder yet, with a line for each.
 
     Returns the results of all.
-
-    What failed before comes last.
     """
     _prepare(device, {case.model for case in cases})
     return run_cases(

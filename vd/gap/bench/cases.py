@@ -31,8 +31,6 @@ def run_cases(
 ) -> list[dict[str, Any]]:
     """Run the cases that have no result in the folder yet, with a line for each.
 
-    What failed before comes last.
-
     Args:
         cases: Tuples or data with a ``name``.
         folder: Of their results.
@@ -47,16 +45,11 @@ def run_cases(
     """
     make_folder(folder)
     done = {}
-    missing = []
-    failed = []
+    waiting = []
     for case in cases:
-        result = read_result(folder / f"{case.name}.json")
-        done[case] = result
-        if result is None:
-            missing.append(case)
-        elif "error" in result:
-            failed.append(case)
-    waiting = missing + failed
+        result = done[case] = read_result(folder / f"{case.name}.json")
+        if result is None or "error" in result:
+            waiting.append(case)
     print(
         f"{len(cases) - len(waiting)} of {len(cases)} cases have results; {len(waiting)} to run",
         flush=True,

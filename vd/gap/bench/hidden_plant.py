@@ -22,8 +22,6 @@ STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is
 smooth.
 """
-FULL_DUTY_RAD = 1.2
-"""Error at full P gain that asks for all of the supply [rad], as of a soft X-series servo."""
 PARTS = 8
 """Parts of a step in which the reference is kept: a motor at its limit must not act before the
 command arrives, nor a profile stop late."""
@@ -123,22 +121,7 @@ class PlantRun:
     seed: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class PlantMotion:
-    """What an ideal sensor would record at the stamps of a run: noise and counts not included.
-
-    Attributes:
-        position: With the effects on reading [T, J] [rad].
-        duty: Duty cycle in [-1, 1] [T, J]: a position servo's controller's output, of the error
-            that it sees, less what it ignores, plus what it has integrated. The damping is the
-            motor's own, and a late reading is one of position.
-    """
-
-    position: np.ndarray
-    duty: np.ndarray
-
-
-def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[PlantMotion]:
+def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[np.ndarray]:
     """Simulate runs together.
 
     Args:
@@ -146,12 +129,15 @@ def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[Plant
             none.
         dt: Time step [s]; that of the first plant by default.
 
+    Returns:
+        What an ideal sensor would record at the stamps of each run [T, J] [rad].
+
     Raises:
         ValueError: An effect is too stiff for the time step.
     """
     dt = runs[0].plant.physics.step_s if dt is None else dt
     batch = _Batch(runs, dt)
-    path, asked = batch.integrate(batch.references())
+    path = batch.integrate(batch.references())
     grid = np.arange(path.shape[0]) * dt
     delay = batch.of("read_delay", "delay_s")
     bias = batch.of("encoder_bias", "bias_rad")
@@ -160,10 +146,7 @@ def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[Plant
         position = np.empty((len(run.time), batch.count))
         for j in range(batch.count):
             position[:, j] = np.interp(run.time - delay[b, j], grid, path[:, b, j])
-        # The step after the stamp: a command is written before the servo is read.
-        step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
-        duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
-        recorded.append(PlantMotion(position + bias[b], duty))
+        recorded.append(position + bias[b])
     return recorded
 
 
@@ -276,11 +259,8 @@ class _Batch:
             on[:, b] = run.enabled[np.maximum(np.searchsorted(run.time, grid, side="right") - 1, 0)]
         return on
 
-    def integrate(self, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [K + 1, B, J] from rest at the equilibrium of the first of the :meth:`references`.
-
-        Also what the controllers ask for in each step, as an error at full gain [K, B, J] [rad].
-        """
+    def integrate(self, reference: np.ndarray) -> np.ndarray:
+        """Positions [K + 1, B, J] from rest at the equilibrium of the first of the :meth:`references`."""
         dt = self.dt
         half = 0.5 * self.dt
         loads = _Loads(self, dt)
@@ -296,7 +276,6 @@ class _Batch:
         v = np.zeros_like(q)
         wound = np.zeros_like(q)
         path = np.empty((self.steps + 1, *q.shape))
-        asked = np.empty((self.steps, *q.shape))
         path[0] = q
         loads.start(q)
         for k, on in enumerate(switch):
@@ -309,7 +288,6 @@ class _Batch:
             error = error - np.clip(error, -dead, dead)
             wound = wound + dt * _mean(error) * (on > 0.0)
             wanted = gain * (self.kp * error + integral_gain * wound)
-            asked[k] = _mean(wanted) / self.kp
             torque, slope, carried = motor(wanted - damping * v, v, k * dt)
             load = loads(middle, v)
             new = self._speed(
@@ -324,7 +302,7 @@ class _Batch:
             q = middle + half * v
             loads.bend(v)
             path[k + 1] = q
-        return path, asked
+        return path
 
     def _speed(
         self,

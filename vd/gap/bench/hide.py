@@ -22,7 +22,6 @@ from vd.gap.bench.hidden_plant import (
     TUNED,
     HiddenPlant,
     Physics,
-    PlantMotion,
     PlantRun,
     simulate,
 )
@@ -39,8 +38,6 @@ NOISE_FLOOR_RAD = math.hypot(NOISE_RAD, ENCODER_COUNT / math.sqrt(12.0))
 STAMP_JITTER_S = 1.0e-3
 """Standard deviation of the sampling instants about the regular ones [s]; the stamps tell them."""
 SHORTEST_PERIOD_S = 1.0e-3
-PWM_COUNTS = 885
-"""Counts of a full duty cycle, as of Dynamixel X servos."""
 BASE_SPREAD = 0.2
 """Base parameters lie within this share of the hand's, as the paper's randomisation has it."""
 PAUSE_S = 2.0
@@ -80,7 +77,6 @@ class Hiding:
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the
             hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
-        pwm: Record the duty cycle as well.
         physics: Of the plant, and of its sensor.
     """
 
@@ -91,7 +87,6 @@ class Hiding:
     excitations: tuple[str, ...] = ("steps_and_sines",)
     base_spread: float = BASE_SPREAD
     mass_spread: float = 0.0
-    pwm: bool = False
     physics: Physics = TUNED
 
 
@@ -191,20 +186,17 @@ def simulate_hidden(hiding: Hiding) -> Hidden:
     moved = _simulate(runs)
     trajectories = []
     for motion, run, own in zip(motions, runs, moved, strict=True):
-        noise = reading_noise(hiding.physics.noise_s, own.position.shape, run.time, rng)
+        noise = reading_noise(hiding.physics.noise_s, own.shape, run.time, rng)
         recorded = replace(
             motion,
             conditions={"p_gain": plant.full_gain, **motion.conditions},
             time=run.time,
-            position=np.round((own.position + noise) / ENCODER_COUNT) * ENCODER_COUNT,
-            pwm=np.round(own.duty * PWM_COUNTS) / PWM_COUNTS if hiding.pwm else None,
+            position=np.round((own + noise) / ENCODER_COUNT) * ENCODER_COUNT,
         )
         trajectories.append(recorded)
     servo: dict[str, Any] = {"model": "test rig", "p_gain": plant.full_gain}
     if hiding.model in BARE_MODELS:  # without masses nothing else tells how large torques are
         servo[STIFFNESS] = _by_joint(plant, plant.kp)
-    if hiding.pwm:
-        servo["pwm_full_scale"] = PWM_COUNTS
     recording = Recording(
         Path(), hiding.model, plant.joints, servo, ENCODER_COUNT, tuple(trajectories)
     )
@@ -221,10 +213,10 @@ def _stamps(motion: Trajectory, rng: np.random.Generator) -> np.ndarray:
     return np.round(time, 6)
 
 
-def _simulate(runs: Sequence[PlantRun]) -> list[PlantMotion]:
+def _simulate(runs: Sequence[PlantRun]) -> list[np.ndarray]:
     """Simulate runs, those of about the same length together: a batch runs as long as its longest."""
     order = sorted(range(len(runs)), key=lambda index: runs[index].time[-1])
-    moved: dict[int, PlantMotion] = {}
+    moved: dict[int, np.ndarray] = {}
     for start in range(0, len(order), CHUNK):
         part = order[start : start + CHUNK]
         motions = simulate([runs[index] for index in part])
