@@ -12,6 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
+from vd.geometry.quaternions import rotation_distance
 from vd.policy.senses import Senses
 from vd.train.student.sequences import Looks, flow_loss
 from vd.vision.acting import ActingStudent
@@ -83,7 +84,6 @@ def test_without_weights_it_does_nothing_and_believes_what_it_did():
         assert not decision.action.any()
         torch.testing.assert_close(look.belief.rotation, sight.belief.rotation)
         torch.testing.assert_close(look.belief.position, sight.belief.position)
-        assert (decision.log_distance == 0.0).all()
 
 
 def test_what_it_says_depends_on_every_thing_that_it_reads():
@@ -112,9 +112,7 @@ def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
     for step, sight in enumerate(steps):
         _, decision = network.act(sight, hidden)
         hidden = decision.hidden.masked_fill(done[step, :, None], 0.0)
-        for name in ("action", "log_distance"):
-            found = getattr(decision, name)
-            torch.testing.assert_close(found, getattr(whole, name)[step], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(decision.action, whole.action[step], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(hidden, whole.hidden)
     assert not hidden[2].any()
 
@@ -404,6 +402,18 @@ def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
     torch.testing.assert_close(acting.belief.rotation[0], torch.eye(3))
 
 
+def test_it_stops_by_the_angle_from_its_belief_to_the_goal_and_not_before_it_saw_anything():
+    hand = load_hand("dclaw3")
+    senses = senses_of(hand, 2, torch.device("cpu"))
+    acting = ActingStudent(student(), hand, torch.randn(2, 50, 3))
+    seen = torch.tensor([0.01, -0.02, 0.16]) + 0.02 * torch.randn(2, 40, 3)
+    seen[1] = torch.nan
+    decision = acting.step(dataclasses.replace(senses, points=seen))
+    angle = rotation_distance(decision.orientation, senses.goal_quat)
+    torch.testing.assert_close(decision.angle[0], angle[0], atol=1e-3, rtol=0.0)
+    assert decision.angle[1].isnan()
+
+
 def test_it_learns_in_half_precision(device):
     place = torch.device(wp.device_to_torch(device))
     network = student().train().to(place)
@@ -415,7 +425,7 @@ def test_it_learns_in_half_precision(device):
     assert decision.action.dtype == look.belief.rotation.dtype == torch.float32
     torch.testing.assert_close(decision.action, decided.action, atol=0.02, rtol=0.02)
     assert (look.flow.shift != single.flow.shift).any()
-    spoken = [decision.action, decision.log_distance, look.flow.shift, look.flow.log_scale]
+    spoken = [decision.action, look.flow.shift, look.flow.log_scale]
     sum(value.square().sum() for value in spoken).backward()
     for name, weight in network.named_parameters():
         assert torch.isfinite(weight.grad).all(), name

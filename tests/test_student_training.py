@@ -20,13 +20,13 @@ from vd.train.checkpoint import list_checkpoints
 from vd.train.student import made
 from vd.train.student.build import build_student
 from vd.train.student.config import SimulatedCfg, StudentTrainCfg, smoke
-from vd.train.student.sequences import Sequences, acting_losses, belief_errors, flow_loss
+from vd.train.student.sequences import belief_errors, flow_loss
 from vd.train.student.simulated import BeliefErrors
 from vd.vision.acting import StudentPolicy
 from vd.vision.cfg import StudentCfg
 from vd.vision.inputs import Belief, carried
 from vd.vision.rotations import quaternion_matrices, random_rotations
-from vd.vision.student import Decision, rigid_motion
+from vd.vision.student import rigid_motion
 
 CPU = torch.device("cpu")
 
@@ -77,7 +77,7 @@ def test_every_stage_learns_what_it_is_shown(stage, tmp_path):
         if sequences is not None:
             figures |= trainer.act(sequences, 0.0)
         first = first or figures
-    for name in {"loss/flow", "loss/distance", "loss/action"} & figures.keys():
+    for name in {"loss/flow", "loss/action"} & figures.keys():
         assert figures[name] < first[name], name
     assert figures["loss/flow"] < first["loss/flow"] - 0.5  # a likelihood half as large again
     trainer.close()
@@ -97,7 +97,7 @@ def test_seeing_and_acting_learn_by_themselves(tmp_path):
     assert eyes == {"stages", "flow"}
     trainer.act(next(trainer.source.sequences()), 0.0)
     rest = changed() - eyes
-    assert rest == {"senses", "memory", "head", "action", "log_distance"}
+    assert rest == {"senses", "memory", "head", "action"}
     trainer.close()
 
 
@@ -194,7 +194,7 @@ def test_errors_of_beliefs_are_as_large_and_last_as_they_are_said_to():
 
 
 def test_losses_are_least_at_the_truth(tmp_path):
-    trainer = trainer_of(settings(0, tmp_path))
+    trainer = trainer_of(settings(1, tmp_path))
     assert trainer.source.collect(trainer.acting, lambda: False)
     looks = next(trainer.source.looks(trainer.acting))
     truth = looks.truth
@@ -209,16 +209,13 @@ def test_losses_are_least_at_the_truth(tmp_path):
     rotation, position = rigid_motion(exact, len(moved))
     torch.testing.assert_close(rotation @ believed.rotation, truth.rotation, atol=1e-3, rtol=0.0)
     torch.testing.assert_close(believed.position + position, truth.position)
-    label = torch.full((2, 4, 9), 0.3)
-    distance = torch.rand(2, 4)
-    hidden = torch.zeros(4, 1)
-    done = torch.zeros((2, 4), dtype=torch.bool)
-    sequences = Sequences(label, hidden, done, label, distance)
-    right = Decision(label, distance.clamp(min=0.02).log(), hidden)
-    losses = acting_losses(right, sequences, trainer.cfg.learn)
-    assert float(losses["action"]) == float(losses["distance"]) == 0.0
-    off = acting_losses(replace(right, action=label + 0.1), sequences, trainer.cfg.learn)
-    assert float(off["action"]) == pytest.approx(0.01)
+    sequences = next(trainer.source.sequences())
+    label = torch.full_like(sequences.label, 0.3)
+    for weight in trainer.network.action.parameters():
+        weight.data.zero_()
+    acted = trainer.act(replace(sequences, label=label), 0.0)
+    assert float(acted["loss/action"]) == pytest.approx(0.09)
+    trainer.close()
 
 
 @pytest.mark.parametrize("stage", [0, 1, 2])

@@ -43,14 +43,11 @@ class LearnCfg:
     """Optimiser steps over which the learning rate rises from 0, linearly."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the convolutions' products."""
-    distance_weight: float = 0.1
-    """Of the squared error of the logarithm of the distance to the goal, beside the squared error of
-    the teacher's action."""
 
     def validate(self) -> None:
         """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
         require(self, "--learn.", "positive", "window batch sequences learning_rate")
-        require(self, "--learn.", "zero or positive", "warmup_steps distance_weight")
+        require(self, "--learn.", "zero or positive", "warmup_steps")
 
 
 @dataclass

@@ -9,13 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vd.train.student.config import LearnCfg
 from vd.vision.inputs import Belief, StudentInput, carried
 from vd.vision.rotations import turn_angle
-from vd.vision.student import SHIFT_M, Decision, Flow
-
-LEAST_DISTANCE_RAD = 0.02
-"""Distances to the goal below this count as this: nothing is stopped as near."""
+from vd.vision.student import SHIFT_M, Flow
 
 
 @dataclass(frozen=True)
@@ -40,8 +36,6 @@ class Sequences:
     """Whether an episode ended with a step, bool [T, B]."""
     label: Tensor
     """What the teacher does [T, B, A]."""
-    distance: Tensor
-    """Angle to the goal [rad] [T, B]."""
 
 
 def belief_errors(belief: Belief, truth: Belief) -> tuple[Tensor, Tensor]:
@@ -58,13 +52,3 @@ def flow_loss(flow: Flow, looks: Looks) -> Tensor:
     end = carried(flow.start[:, None], turn[flow.look])[:, 0] + offset[flow.look]
     off = (flow.start + flow.shift - end).norm(dim=-1) / SHIFT_M
     return (off * torch.exp(-flow.log_scale) + 3.0 * flow.log_scale).mean()
-
-
-def acting_losses(decision: Decision, sequences: Sequences, cfg: LearnCfg) -> dict[str, Tensor]:
-    """Weighted losses by name, means over all steps."""
-    off = sequences.label - decision.action
-    distance = sequences.distance.clamp(min=LEAST_DISTANCE_RAD).log()
-    return {
-        "action": off.square().mean(),
-        "distance": cfg.distance_weight * (decision.log_distance - distance).square().mean(),
-    }

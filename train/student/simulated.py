@@ -30,7 +30,7 @@ from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
 from vd.vision.inputs import Belief, StudentInput, carried, each, joined
-from vd.vision.rotations import matrices_about, quaternion_matrices, turn_angle
+from vd.vision.rotations import matrices_about, quaternion_matrices
 
 KEPT = 0.9
 """Of an error of a belief, in the next step (ours): they last most of a second. Not tuned."""
@@ -142,8 +142,7 @@ class SimulatedSequences:
             decision = acting.decide(told, sight.frame)
             label = self.labels()
             named = acting.build.frames.joints_in(label, sight.frame)
-            distance = turn_angle(truth.rotation.mT @ sight.goal_rotation)
-            steps.append((told, named, distance, senses.fresh))
+            steps.append((told, named, senses.fresh))
             turn, shift = belief_errors(belief, truth)
             wrong = (decision.action - label).abs()
             _, _, _, extras = self.env.step(decision.action)
@@ -159,13 +158,12 @@ class SimulatedSequences:
         self.env.env.check()
         sights = joined([look.sight for look in looks])
         self._looks = Looks(sights, joined([look.truth for look in looks]))
-        told, labels, distances, fresh = map(torch.stack, zip(*steps, strict=True))
+        told, labels, fresh = map(torch.stack, zip(*steps, strict=True))
         self._done = Sequences(
             told=told,
             hidden=hidden.masked_fill(fresh[0, :, None], 0.0),
             done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
             label=labels,
-            distance=distances,
         )
         return True
 
@@ -227,7 +225,6 @@ class SimulatedSequences:
                     hidden=done.hidden[rows],
                     done=done.done[:, rows],
                     label=done.label[:, rows],
-                    distance=done.distance[:, rows],
                 )
 
     def senses(self) -> Senses:

@@ -15,7 +15,6 @@ from vd.train.student.made import MadeSequences
 from vd.train.student.sequences import (
     Looks,
     Sequences,
-    acting_losses,
     belief_errors,
     flow_loss,
 )
@@ -107,11 +106,11 @@ class StudentTrainer(SupervisedLoop):
         return logged
 
     def act(self, sequences: Sequences, done: float) -> dict[str, Tensor]:
-        """One optimiser step of what acts; its losses."""
+        """One optimiser step of what acts; its loss."""
         self.network.train()
         decision = self.network(sequences.told, sequences.hidden, sequences.done)
-        losses = acting_losses(decision, sequences, self.cfg.learn)
-        return self._descend(losses, done, self._acting)
+        off = sequences.label - decision.action
+        return self._descend({"action": off.square().mean()}, done, self._acting)
 
     def _share_statistics(self) -> None:
         """Average the batch norms' running statistics over the processes."""

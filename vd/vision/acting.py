@@ -12,7 +12,7 @@ from vd.geometry.quaternions import product, rotated
 from vd.policy.contract import Contract, Contracted, StudentSpec
 from vd.policy.senses import CameraDecision, Senses
 from vd.vision.inputs import Belief, InputBuilder, StudentInput, each
-from vd.vision.rotations import cube_rotations
+from vd.vision.rotations import cube_rotations, turn_angle
 from vd.vision.student import Decision, Look, Student
 
 LEAST_SEEN = 32
@@ -154,9 +154,11 @@ class ActingStudent:
         decision = self.decide(look.told, sight.frame)
         pose = self.pose
         turn = self._base[:, 3:]
+        goal = self.build.goal_rotation(senses.goal_quat)
+        angle = turn_angle(self.belief.rotation.mT @ goal)
         return CameraDecision(
             action=decision.action,
-            angle=decision.log_distance.exp(),
+            angle=angle.masked_fill(self.lost, torch.nan),
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),
             voxels=look.voxels,

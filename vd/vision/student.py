@@ -82,8 +82,6 @@ class Decision:
 
     action: Tensor
     """The action, not clipped [.., A]."""
-    log_distance: Tensor
-    """Logarithm of the angle to the goal [rad] [..]."""
     hidden: Tensor
     """Memory after the last step [N, G]."""
 
@@ -196,7 +194,6 @@ class Student(nn.Module):
             nn.GELU(),
         )
         self.action = nn.Linear(cfg.head, num_actions)
-        self.log_distance = nn.Linear(cfg.head, 1)
 
     def first_hidden(self, envs: int) -> Tensor:
         """The memory where an episode begins: zeros [N, G]."""
@@ -277,12 +274,12 @@ class Student(nn.Module):
         sensed = self.senses(told)
         remembered, hidden = self._remember(sensed, hidden, done)
         decided = self.head(torch.cat([remembered, sensed], dim=-1))
-        return Decision(self.action(decided), self.log_distance(decided).squeeze(-1), hidden)
+        return Decision(self.action(decided), hidden)
 
     def decide(self, told: Tensor, hidden: Tensor) -> Decision:
         """Decide in one step of N hands, leading axes [N]."""
         step = self(told[None], hidden)
-        return Decision(step.action[0], step.log_distance[0], step.hidden)
+        return Decision(step.action[0], step.hidden)
 
     def act(self, sight: StudentInput, hidden: Tensor) -> tuple[Look, Decision]:
         """Look, and decide: one step of N hands, leading axes [N]."""
