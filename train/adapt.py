@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
@@ -15,8 +14,6 @@ from vd.envs.cfg import CurriculumCfg, LevelCfg, LooseCfg
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
 from vd.policy.agents import (
-    DEFAULT_HAND,
-    DEFAULT_POLICY,
     NO_LAYER,
     check_names,
     default_policy,
@@ -85,9 +82,6 @@ class AdaptCfg:
     max_minutes: float | None = None
     """End the training after this much time, as of vd-train teacher, and compare; 7 by default on a
     CPU."""
-    smoke: bool = False
-    """Check the installation: the same, tiny, on the CPU, for at most a minute or two, of the hand
-    as it is. It learns nothing, and nothing is kept."""
     episodes: int = 20
     """Starts and goals of every object in the comparison."""
     seed: int = 0
@@ -107,16 +101,13 @@ def adapt_command(arguments: list[str]) -> int:
     cfg: AdaptCfg = parse(AdaptCfg, arguments, prog="vd-train adapt")
     require(cfg, "--", "positive", "num_envs steps episodes")
     require(cfg, "--", "zero or positive", "seed")
-    if not cfg.smoke:
-        return _adapt(with_defaults(cfg))
-    with TemporaryDirectory(prefix="vd-smoke-") as folder:
-        return _adapt(_shrunk(cfg, Path(folder)))
+    return _adapt(with_defaults(cfg))
 
 
 def _adapt(cfg: AdaptCfg) -> int:
     """Train and compare; the exit status."""
     say = say_of_main()
-    with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
+    with run_folder(teacher_cfg(cfg)) as run:
         status = train(run, say)
         if status == 0 and is_main():
             compare_models(cfg, run, say)
@@ -158,28 +149,6 @@ def with_defaults(cfg: AdaptCfg) -> AdaptCfg:
                 words += value if isinstance(value, tuple) else [value]
         say_same_as("vd-train", "adapt", *words, "--out", cfg.out)
     return full
-
-
-def _shrunk(cfg: AdaptCfg, folder: Path) -> AdaptCfg:
-    """An adaptation of everything in a minute or two, in ``folder``, to the hand as it is."""
-    from vd.assets_usd.hand_layer import write_layer
-    from vd.assets_usd.hands import load_hand
-
-    layer = folder / "as-it-is.usda"
-    hand = load_hand(DEFAULT_HAND)
-    write_layer(layer, hand, baseline={}, effects={}, tool="vd-train", recording="none")
-    return replace(
-        cfg,
-        policy=DEFAULT_POLICY,
-        hand_layer=layer,
-        out=folder / "run",
-        objects=("cube",),
-        num_envs=16,
-        steps=256,
-        episodes=1,
-        max_minutes=1.0,
-        device="cpu",
-    )
 
 
 def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
@@ -262,4 +231,4 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     title = f"{before}, adapted to an identified hand"
     how = settings_text([rows[0].protocol])
     write_page(result, page, title=title, lead=summary, notes=(f"{how}.",))
-    say(summary if cfg.smoke else f"{summary}\n{page}")
+    say(f"{summary}\n{page}")
