@@ -87,8 +87,9 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
     from vd.policy.actor import TrainedPolicy
     from vd.policy.contract import SEAL_KEY, UNSEALED, sealed
     from vd.policy.onnx import onnx_metadata
+    from vd.vision.acting import StudentPolicy
 
-    if policy.kind in ("student", "vision"):
+    if isinstance(policy, StudentPolicy) or policy.kind == "vision":
         raise ValueError(f"{path}: what a {policy.kind} policy sees by is not exported to ONNX")
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
     network = teacher.network.eval().requires_grad_(False)
