@@ -96,6 +96,8 @@ class GapCommand:
     seeds: int = 5
     """Recordings of each effect and size; 40 times as many with nothing hidden, or only another
     stiffness, damping or mass."""
+    first_seed: int = 0
+    """Seed of the first recording: others than those that the method was tuned on."""
     battery: Literal["tuned", "development", "closed"] = "tuned"
     """Plants and seeds: as the rules were tuned on, others to develop on, or those that judge a
     finished method once."""
@@ -127,6 +129,7 @@ class GapCommand:
             effects=self.effects,
             sizes=self.sizes,
             seeds=self.seeds,
+            first_seed=self.first_seed,
             which=self.battery,
         )
         results = run_battery(
@@ -141,7 +144,7 @@ class GapCommand:
         if self.json is not None:
             known = [figure for figure in reached if figure.values]
             row = {f.what: {"value": f.value, "cases": len(f.values)} for f in known}
-            stamp: dict[str, object] = dict(measured_by(device, GAP))
+            stamp: dict[str, object] = {"seed": self.first_seed, **measured_by(device, GAP)}
             write_json(self.json, stamp | {"rows": [row]})
         write_text(self.out / "summary.md", table(reached))
         print(table(reached))
