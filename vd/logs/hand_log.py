@@ -10,6 +10,7 @@ times are seconds since the start. A row is a state, read at ``t``, and the goal
 ``t_command``.
 """
 
+import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -156,17 +157,20 @@ def read_columns(file: Path) -> dict[str, np.ndarray]:
     """
     if not file.is_file():
         raise LogError(f"{file} is missing; copy the whole folder again")
-    text = file.read_text()
-    whole = text[: text.rfind("\n") + 1]  # the last row of a log that was cut short has no end
-    header, *rows = whole.splitlines() or [""]
-    names = header.split(",")
-    if not rows:
-        raise LogError(f"{file} has no rows")
     try:
-        values = np.loadtxt(rows, delimiter=",", ndmin=2)
-        return dict(zip(names, values.T, strict=True))
+        with file.open(newline="") as stream:
+            header, *rows = [*csv.reader(stream)] or [[]]
+        if rows and len(rows[-1]) < len(header):  # the last row of a log that was cut short
+            rows.pop()
+        for number, row in enumerate(rows, 2):
+            if len(row) != len(header):
+                raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
+        values = np.array(rows, dtype=float)
     except ValueError as error:
         raise LogError(f"{file} is damaged ({error}); copy the whole folder again") from error
+    if not rows:
+        raise LogError(f"{file} has no rows")
+    return dict(zip(header, values.T, strict=True))
 
 
 def _events(file: Path) -> list[dict[str, Any]]:
