@@ -13,6 +13,8 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 TORCH_INDEX ?=
 # Processes of the tests; each of them compiles and simulates, so more than cores only slows down.
 TEST_JOBS ?= 2
+# Folder of OBJ, STL, PLY or GLB files for the demo: make demo MESHES=DIR.
+MESHES ?=
 DEMO_ARGS ?=
 TEST_ARGS ?=
 BENCH_ARGS ?=
@@ -26,7 +28,7 @@ FIGURES_ARGS ?=
 
 help:
 	@echo 'make demo     turn unseen objects, close a gap, drive a simulated hand, train a little: demo/index.html'
-	@echo '              DEMO_ARGS=--quick ends after the first part'
+	@echo '              MESHES=DIR turns your own meshes; DEMO_ARGS=--quick ends after the first part'
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
 	@echo 'make coverage  the same, and which lines no test runs'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
@@ -53,7 +55,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/python -m vd.train.demo $(DEMO_ARGS)
+	$(BIN)/python -m vd.train.demo $(if $(MESHES),--meshes "$(MESHES)") $(DEMO_ARGS)
 
 # A file's tests stay in one process: its fixtures build simulators, which is what takes the time.
 # Files keep the order of tests/conftest.py, which puts slow ones first.

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import trimesh
 import tyro
 from gap_reports import rubbing_servo, servo_report
 from test_evaluate_trace import compared
@@ -146,6 +147,40 @@ def test_a_training_that_learned_nothing_says_so(played, tmp_path, monkeypatch):
     assert main(["--out", str(tmp_path / "demo")]) == 0
     text = (tmp_path / "demo" / "index.html").read_text()
     assert "from 18.0 to" in text and "no learning" in text
+
+
+def test_compact_meshes_are_turned_and_built_in_objects_fill_up(played, tmp_path, monkeypatch):
+    """Small files of flat and long things, and of nothing, are passed over."""
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    (meshes / "broken.stl").write_text("nothing")
+    for name, sides in {
+        "knife": (20, 2, 1),
+        "a": (2, 1, 1),
+        "b": (3, 2, 2),
+        "disc": (9, 9, 1),
+    }.items():
+        trimesh.creation.box(sides).export(meshes / f"{name}.stl")
+    trimesh.creation.icosphere(2).export(meshes / "c.stl")
+
+    def leave_set(line):
+        option(line, "--out").mkdir()
+        (option(line, "--out") / "a.usda").touch()
+
+    monkeypatch.setitem(LEAVE, "vd-assets import", leave_set)
+    assert main(["--out", str(tmp_path / "demo"), "--meshes", str(meshes)]) == 0
+    words = played[0][2 : played[0].index("--out")]
+    assert [Path(word).name for word in words] == ["a.stl", "b.stl", "c.stl"]
+    folder = tmp_path / "demo" / "camera" / "objects"
+    at = played[1].index("--objects")
+    assert played[1][at + 1 : at + 3] == [str(folder), "procedural-heldout-3-seed0"]
+    flown = next(line for line in played if line[0] == "vd-deploy")
+    assert option(flown, "--object") == folder / "a.usda" and flown[1] == "dclaw4-vision"
+    assert "fewer than four" in (tmp_path / "demo" / "index.html").read_text()
+    monkeypatch.delitem(LEAVE, "vd-assets import")
+    assert main(["--out", str(tmp_path / "none"), "--meshes", str(meshes)]) == 0, "none imported"
+    flown = [line for line in played if line[0] == "vd-deploy"][-1]
+    assert flown[flown.index("--object") + 1] == "procedural-heldout-1-seed0"
 
 
 def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsys):
