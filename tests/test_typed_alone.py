@@ -4,6 +4,7 @@ Runs that would be long end at that line; the line is a command that asks for th
 """
 
 import importlib
+import math
 import re
 import shlex
 import subprocess
@@ -21,6 +22,7 @@ from vd.deploy.loop.goals import drawn_goals
 from vd.evaluate.statistics import symmetric_error
 from vd.logs.recording import write_recording
 from vd.policy.agents import default_policy
+from vd.train import adapt, tracker
 from vd.train.alignment.cli import ALIGNMENT
 from vd.train.flags import parse_teacher
 from vd.train.stages import parse_stage
@@ -170,9 +172,9 @@ def test_a_hand_of_teachers_alone_names_them(typed, leap, tmp_path):
 
 @pytest.mark.parametrize(
     "command",
-    ["teacher", "student --stage 2", "alignment", "alignment --stage 1"],
+    ["teacher", "student --stage 2", "alignment", "alignment --stage 1", "adapt", "tracker"],
 )
-def test_a_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
+def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
     command, typed, tmp_path, monkeypatch
 ):
     given = []
@@ -181,12 +183,17 @@ def test_a_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
         given.append(cfg)
         return 0
 
-    for place in ("teacher.train", "stages.train_stage"):
+    for place in ("teacher.train", "adapt._adapt", "tracker._track", "stages.train_stage"):
         monkeypatch.setattr(f"vd.train.{place}", note)
     assert typed(f"vd-train {command} --smoke")[0] == 0
     assert not list(tmp_path.iterdir())
     (cfg,) = given
-    assert cfg.smoke and cfg.run.max_steps <= 2048 and cfg.run.device == "cpu"
+    if isinstance(cfg, tracker.TrackerCfg):
+        assert (cfg.objects, cfg.episodes, cfg.stop_tolerance) == (("cube",), 2, math.pi)
+    elif isinstance(cfg, adapt.AdaptCfg):
+        assert cfg.policy == "dclaw4" and cfg.num_envs == 16 and cfg.steps <= 2048
+    else:
+        assert cfg.smoke and cfg.run.max_steps <= 2048 and cfg.run.device == "cpu"
 
 
 @pytest.mark.slow

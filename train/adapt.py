@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
@@ -12,6 +13,8 @@ from vd.command.line import parse, say_same_as
 from vd.envs.cfg import CurriculumCfg, LevelCfg, LooseCfg
 from vd.evaluate.conditions import EXACT
 from vd.policy.agents import (
+    DEFAULT_HAND,
+    DEFAULT_POLICY,
     NO_LAYER,
     check_names,
     default_policy,
@@ -73,6 +76,9 @@ class AdaptCfg:
     """Control steps to train for, all environments together."""
     max_minutes: float | None = None
     """End the training after this much time, as of vd-train teacher; 7 by default on a CPU."""
+    smoke: bool = False
+    """Check the installation: the same, tiny, on the CPU, for at most a minute or two, of the hand
+    as it is. It learns nothing, and nothing is kept."""
     seed: int = 0
     """Of the training."""
     device: str = "auto"
@@ -89,15 +95,18 @@ def adapt_command(arguments: list[str]) -> int:
     """
     cfg: AdaptCfg = parse(AdaptCfg, arguments, prog="vd-train adapt")
     require(cfg, "--", "positive", "num_envs steps")
-    return _adapt(with_defaults(cfg))
+    if not cfg.smoke:
+        return _adapt(with_defaults(cfg))
+    with TemporaryDirectory(prefix="vd-smoke-") as folder:
+        return _adapt(_shrunk(cfg, Path(folder)))
 
 
 def _adapt(cfg: AdaptCfg) -> int:
     """Train; the exit status."""
     say = say_of_main()
-    with run_folder(teacher_cfg(cfg)) as run:
+    with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
         status = train(run, say)
-    if status == 0:
+    if status == 0 and not cfg.smoke:
         say(f"compare: vd-eval {cfg.policy} {policy_at(cfg.out)} --hand-layer {cfg.hand_layer}")
     return status
 
@@ -137,6 +146,27 @@ def with_defaults(cfg: AdaptCfg) -> AdaptCfg:
                 words += value if isinstance(value, tuple) else [value]
         say_same_as("vd-train", "adapt", *words, "--out", cfg.out)
     return full
+
+
+def _shrunk(cfg: AdaptCfg, folder: Path) -> AdaptCfg:
+    """An adaptation of everything in a minute or two, in ``folder``, to the hand as it is."""
+    from vd.assets_usd.hand_layer import write_layer
+    from vd.assets_usd.hands import load_hand
+
+    layer = folder / "as-it-is.usda"
+    hand = load_hand(DEFAULT_HAND)
+    write_layer(layer, hand, baseline={}, effects={}, tool="vd-train", recording="none")
+    return replace(
+        cfg,
+        policy=DEFAULT_POLICY,
+        hand_layer=layer,
+        out=folder / "run",
+        objects=("cube",),
+        num_envs=16,
+        steps=256,
+        max_minutes=1.0,
+        device="cpu",
+    )
 
 
 def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -55,6 +56,8 @@ class TrackerCfg(EpisodeFlags):
     and quaternion xyzw; that of the network's training or the hand's own camera by default."""
     episodes: int | None = None  # type: ignore[assignment]  # who is told none chooses
     """Episodes; rounded up to as many of each object. 256 by default, 64 on a CPU."""
+    smoke: bool = False
+    """Check the installation: two episodes with a cube, on the CPU. Nothing is kept."""
     goals: Goals = "points"
     seed: int = 1000
 
@@ -73,7 +76,11 @@ def tracker_command(arguments: Sequence[str]) -> int:
     cfg.validate()
     check_suffix(cfg.out, SUFFIX)
     check_names([cfg.teacher], cfg.objects)
-    return _track(with_defaults(cfg))
+    if not cfg.smoke:
+        return _track(with_defaults(cfg))
+    with TemporaryDirectory(prefix="vd-smoke-") as folder:
+        tiny = replace(cfg, objects=("cube",), episodes=2, device="cpu", stop_tolerance=math.pi)
+        return _track(replace(tiny, out=Path(folder) / cfg.out.name))
 
 
 def with_defaults(cfg: TrackerCfg) -> TrackerCfg:
