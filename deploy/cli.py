@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vd.command import interrupt
-from vd.command.line import behind_command, parse
+from vd.command.line import parse
 
 OK, FAILED = 0, interrupt.FAILED
 """Exit statuses: done, or not, with the reason; after a signal 128 and its number."""
@@ -61,7 +61,7 @@ def _no_policy(text: str) -> str:
 @interrupt.command("vd-deploy")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-deploy``; returns the exit status."""
-    arguments = behind_command(sys.argv[1:] if arguments is None else arguments)
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments in (["-h"], ["--help"]):
         print(usage())
         return OK

@@ -105,7 +105,6 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     path.write_text("ppo: {epochs: 3}")
     cfg = parse_teacher(["--config", str(path), "--preset", "gpu"])
     assert cfg.policy == PRESETS["gpu"]().policy and cfg.ppo.epochs == 3
-    for line in ("--config {} --print-config teacher", "--print-config teacher --config={}"):
-        assert "epochs: 3" in run(f"vd-train {line.format(path)}")[1]
+    assert "epochs: 3" in run(f"vd-train teacher --print-config --config={path}")[1]
     path.write_text("stage: 1\npreset: cpu-demo")
     assert parse_stage(ALIGNMENT, ["--config", str(path)]).run.out.name == "cpu-stage1"

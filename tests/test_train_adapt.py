@@ -1,16 +1,16 @@
-"""vd-train adapt: what it takes over of a policy, what it refuses, and what its page compares."""
+"""vd-train adapt: what it takes over of a policy, what it refuses, and how it ends."""
 
-import re
 from dataclasses import replace
 
 import pytest
-from test_evaluate_trace import FakeObject, judged, traced
 
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hands import load_hand
+from vd.command.line import parse
 from vd.envs.cfg import ReorientCfg
+from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
-from vd.evaluate.result import Result
+from vd.policy.agents import policy_at
 from vd.policy.bundle import read_policy
 from vd.train import adapt
 from vd.train.adapt import AdaptCfg, teacher_cfg
@@ -46,21 +46,10 @@ def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone
             teacher_cfg(replace(cfg, policy=name, out=cfg.out.with_name("other")))
 
 
-def test_both_policies_are_compared_in_both_models(cfg, monkeypatch):
-    def compare(asked, model):
-        rows, nominal = [], asked.hand_layer == "none"
-        for name in asked.policies:
-            trace = traced(policy={} if nominal or name == str(cfg.out) else {"until": 0})
-            rows += [
-                replace(row, condition=model)
-                for row in judged(trace, (FakeObject("a"),), policy=name)
-            ]
-        return Result(tuple(rows))
-
-    monkeypatch.setattr("vd.evaluate.compare.compare", compare)
-    said: list[str] = []
-    adapt.compare_models(cfg, teacher_cfg(cfg), said.append)
-    assert re.findall(r"(\S+) %", said[-1]) == ["100.0", "0.0", "100.0"], (
-        "before, there, and adapted"
-    )
-    assert "training, identified" in (cfg.out / adapt.PAGE).read_text()
+def test_it_ends_with_the_line_that_compares_before_and_after(cfg, monkeypatch, capsys):
+    monkeypatch.setattr("vd.train.adapt.train", lambda run, say: 0)
+    assert adapt._adapt(cfg) == 0
+    line = capsys.readouterr().out.partition("compare: vd-eval ")[2].split()
+    compared = parse(EvalCfg, line, prog="vd-eval")
+    assert compared.policies == ("dclaw4", policy_at(cfg.out))
+    assert compared.hand_layer == str(cfg.hand_layer)

@@ -1,6 +1,5 @@
 """``vd-train adapt``: train a teacher further in an identified model of its hand."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +11,6 @@ from vd.command.config import require
 from vd.command.device import resolve_device
 from vd.command.line import parse, say_same_as
 from vd.envs.cfg import CurriculumCfg, LevelCfg, LooseCfg
-from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
 from vd.policy.agents import (
     DEFAULT_HAND,
@@ -27,10 +25,6 @@ from vd.train.flags import saved_config
 from vd.train.presets import TeacherCfg
 from vd.train.teacher import is_main, run_folder, say_of_main, train
 
-PAGE = "adapted.html"
-"""Page of the comparison, in the run's folder."""
-NOMINAL, IDENTIFIED = "nominal", "identified"
-"""Models of the hand in which the policies are compared."""
 LOOSE = 0.4
 """Level of stillness at which it begins: who has to stand still at once learns little. So begun,
 and with nothing random but the layer's numbers, 4.4 points more (2.1 to 6.8) come back than when
@@ -60,10 +54,9 @@ class AdaptCfg:
     number with an interval is drawn from it in every episode; nothing else is random, nor observed
     late. To stand still is asked for little at first, and as before after 461 updates.
 
-    At the end the policy before and after turns the same objects in the nominal and in the
-    identified model: adapted.html in --out. The same command goes on where it was interrupted. For
-    other settings, as the policy's own randomisation, take vd-train teacher --init POLICY
-    --hand-layer LAYER.
+    At the end a line of vd-eval is printed that compares the policy before and after in the
+    identified model. The same command goes on where it was interrupted. For other settings, as the
+    policy's own randomisation, take vd-train teacher --init POLICY --hand-layer LAYER.
     """
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
@@ -73,25 +66,21 @@ class AdaptCfg:
     """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap; by default
     gap/identified.usda."""
     out: Path = Path("runs/adapted")
-    """Folder of the run, as of vd-train teacher, and of the comparison."""
+    """Folder of the run, as of vd-train teacher."""
     objects: tuple[str, ...] = ()
-    """Object sets to train and compare on; by default those of the policy's training, and the cube
-    on a CPU."""
+    """Object sets to train on; by default those of the policy's training, and the cube on a CPU."""
     num_envs: int | None = None
     """Environments simulated side by side; by default as many as in the policy's training, and 256
     on a CPU."""
     steps: int = 100_000_000
     """Control steps to train for, all environments together."""
     max_minutes: float | None = None
-    """End the training after this much time, as of vd-train teacher, and compare; 7 by default on a
-    CPU."""
+    """End the training after this much time, as of vd-train teacher; 7 by default on a CPU."""
     smoke: bool = False
     """Check the installation: the same, tiny, on the CPU, for at most a minute or two, of the hand
     as it is. It learns nothing, and nothing is kept."""
-    episodes: int = 20
-    """Starts and goals of every object in the comparison."""
     seed: int = 0
-    """Of the training and the comparison."""
+    """Of the training."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
 
@@ -105,8 +94,7 @@ def adapt_command(arguments: list[str]) -> int:
         FileExistsError: The folder holds another run.
     """
     cfg: AdaptCfg = parse(AdaptCfg, arguments, prog="vd-train adapt")
-    require(cfg, "--", "positive", "num_envs steps episodes")
-    require(cfg, "--", "zero or positive", "seed")
+    require(cfg, "--", "positive", "num_envs steps")
     if not cfg.smoke:
         return _adapt(with_defaults(cfg))
     with TemporaryDirectory(prefix="vd-smoke-") as folder:
@@ -114,12 +102,12 @@ def adapt_command(arguments: list[str]) -> int:
 
 
 def _adapt(cfg: AdaptCfg) -> int:
-    """Train and compare; the exit status."""
+    """Train; the exit status."""
     say = say_of_main()
     with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
         status = train(run, say)
-        if status == 0 and is_main():
-            compare_models(cfg, run, say)
+    if status == 0 and not cfg.smoke:
+        say(f"compare: vd-eval {cfg.policy} {policy_at(cfg.out)} --hand-layer {cfg.hand_layer}")
     return status
 
 
@@ -176,7 +164,6 @@ def _shrunk(cfg: AdaptCfg, folder: Path) -> AdaptCfg:
         objects=("cube",),
         num_envs=16,
         steps=256,
-        episodes=1,
         max_minutes=1.0,
         device="cpu",
     )
@@ -225,41 +212,3 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     if there is not None and (there.init, there.env) != (run.init, run.env):
         raise FileExistsError(f"{cfg.out} holds a run of other settings; choose another --out")
     return run
-
-
-def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
-    """Compare the policy before and after, in both models of the hand, and write the page."""
-    from vd.evaluate.compare import compare
-    from vd.evaluate.page import percent, settings_text, shown_name, write_page
-    from vd.evaluate.result import SUCCESS, Result
-
-    say("comparing the policy before and after, in the nominal and in the identified model ...")
-    before = str(cfg.policy)
-    after = policy_at(cfg.out)
-    evaluation = EvalCfg(
-        policies=(before, after),
-        objects=run.env.objects,
-        episodes=cfg.episodes,
-        seed=cfg.seed,
-        device=cfg.device,
-    )
-    results = []
-    for model, layer in ((NOMINAL, NO_LAYER), (IDENTIFIED, str(cfg.hand_layer))):
-        results.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
-    rows = tuple(row for compared in results for row in compared.rows if row.stopped_by != SUCCESS)
-    result = Result(rows, results[0].software)
-    page = cfg.out / PAGE
-    rate = {}
-    for (model, _), headlines in result.headlines().items():
-        for policy, row in headlines.items():
-            rate[model, policy] = percent(row.overall.outcomes["success"])
-    layer = shown_name(str(cfg.hand_layer))
-    summary = (
-        f"{before} succeeds in {rate[NOMINAL, before]} of the episodes in the nominal model of "
-        f"{run.env.hand}, in {rate[IDENTIFIED, before]} in the identified one ({layer}), and "
-        f"adapted to that in {rate[IDENTIFIED, after]}."
-    )
-    title = f"{before}, adapted to an identified hand"
-    how = settings_text([rows[0].protocol])
-    write_page(result, page, title=title, lead=summary, notes=(f"{how}.",))
-    say(summary if cfg.smoke else f"{summary}\n{page}")

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Sequence
 
 from vd.command import interrupt
-from vd.command.line import behind_command
 
 USAGE = """usage: vd-train COMMAND [flags]
 
@@ -50,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 at the end, 1 on an error, 130 after Ctrl-C and 143 after SIGTERM, if saved.
     """
-    arguments = behind_command(sys.argv[1:] if arguments is None else arguments)
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if arguments else interrupt.USAGE_ERROR

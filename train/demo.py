@@ -54,10 +54,10 @@ MISSES = "12"
 """Deadlines missed in a row at which the twin stops: a second, since the machine may do other
 things too.
 """
-LEAST_TRAINING_MIN, AROUND_TRAINING_MIN = 1.0, 1.5
-"""Time that training gets at least [min], and that its start with cold caches, curve and film
-take.
-"""
+LEAST_TRAINING_MIN = 1.0
+"""Time that training gets at least [min]."""
+AROUND_TRAINING_MIN = 1.5
+"""Time that the start of training with cold caches, its curve and its film take [min]."""
 REFRESH_S = 15
 """Seconds after which a browser reads an unfinished page again."""
 TASK = ("--env.goal.max-angle-rad", "3.14", "--env.success.rotation-rad", "0.2")
@@ -219,9 +219,10 @@ class Demo:
         row = next(row for row in Result.read(part.folder / "eval.json").rows if row.headline)
         lines = []
         for summary in (*row.per_object, row.overall):
-            outcomes = summary.outcomes
-            rates = (outcomes["success"], summary.symmetric, outcomes["object falls"])
-            lines.append((summary.name, summary.episodes, *map(percent, rates)))
+            success = percent(summary.outcomes["success"])
+            dropped = percent(summary.outcomes["object falls"])
+            symmetric = percent(summary.symmetric)
+            lines.append((summary.name, summary.episodes, success, symmetric, dropped))
         return {
             "policy": self.policy,
             "sees": "vision" if self.policy.endswith("vision") else "tracking",
@@ -262,12 +263,13 @@ class Demo:
         from vd.logs.hand_log import read_log
 
         run = read_log(log)
-        sent_ms = sorted(1e3 * run.columns["sent_s"])
-        late = f"{sent_ms[len(sent_ms) // 2]:.0f}, at most {sent_ms[-1]:.0f}"
-        stops = ", ".join(stop.outcome for stop in run.stops)
+        sent_ms = 1e3 * run.columns["sent_s"]
+        sent = f"{np.median(sent_ms):.0f}, at most {sent_ms.max():.0f}"
+        missed = f"{run.columns['missed'][-1]:.0f}"
+        outcomes = ", ".join(stop.outcome for stop in run.stops)
         return {
             "film": log / "run.mp4",
-            "row": (len(sent_ms), f"{run.columns['missed'][-1]:.0f}", late, stops),
+            "row": (len(sent_ms), missed, sent, outcomes),
             "object": run.run["object"]["name"],
             "page": f"{part.name}/log/run.html",
         }
@@ -286,7 +288,8 @@ class Demo:
         rows = settled(read_progress(run / PROGRESS_FILE))
         goals = [row["goals_per_episode"] for row in rows]
         tenth = max(1, len(goals) // 10)
-        first, last = (sum(some) / tenth for some in (goals[:tenth], goals[-tenth:]))
+        first = float(np.mean(goals[:tenth]))
+        last = float(np.mean(goals[-tenth:]))
         return {
             "film": film,
             "curves": goal_curve([row["env_steps"] for row in rows], goals),

@@ -2,11 +2,10 @@
 
 import logging
 import warnings
-from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -17,16 +16,11 @@ from vd.command.line import parse
 from vd.policy import ONNX_SUFFIX, SUFFIX, check_suffix, has_suffix
 
 if TYPE_CHECKING:
-    from torch import Tensor
-    from torch.nn import Module
-
     from vd.policy.bundle import AnyPolicy
     from vd.policy.contract import Contract
 
 CHECKED = 64
-"""Random observations, or pairs of clouds, on which the runtime of ONNX is compared."""
-POINTS, CLOUD_M = 512, 0.03
-"""Points of these clouds, and their standard deviation [m]: as of objects."""
+"""Random observations on which the runtime of ONNX is compared."""
 TOLERANCE = 1e-4
 """Largest difference from torch that is rounding of single precision."""
 
@@ -42,9 +36,8 @@ class ExportCfg:
     policy: Annotated[str, tyro.conf.Positional]
     """Checkpoint of vd-train teacher, a policy.safetensors, a run's folder, or a policy's name."""
     output: Annotated[Path, tyro.conf.Positional] = Path(f"policy{SUFFIX}")
-    """File to write. A name that ends in .onnx gets the layers from observation to mean action, and
-    NAME-alignment.onnx beside it the network of a vision policy. They are checked against
-    onnxruntime where that is installed."""
+    """File to write. A name that ends in .onnx gets the layers from observation to mean action,
+    checked against onnxruntime where that is installed."""
     resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write a checkpoint for --resume instead, all but the state of the environments: a run that
     moves to another machine or number of GPUs starts its episodes anew anyway."""
@@ -78,89 +71,48 @@ def export_command(arguments: list[str]) -> int:
 
 
 def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
-    """Write a policy's networks with its contract, and compare them with onnxruntime if it is there.
+    """Write a policy's layers with its contract, and compare them with onnxruntime if it is there.
 
-    The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they
-    normalise, to the mean ``action`` [N, D]. The network of a vision policy goes to
-    NAME-alignment.onnx: clouds about their means, ``goal_points`` [N, G, 3] and ``seen_points`` [N,
-    S, 3] [m], to ``rotation`` [N, 3, 3] and ``offset`` [N, 3] [m] of
-    :class:`vd.vision.alignment.Residual`. N, G and S vary.
+    They take ``observation`` [N, O], which they normalise, to the mean ``action`` [N, D] of any
+    number N of environments. Of a tracking policy they are its teacher's.
 
     Raises:
         ModuleNotFoundError: What the export needs is not installed.
         RuntimeError: Outputs differ by more than rounding.
-        ValueError: It is a student.
+        ValueError: It sees by a network, which is not exported.
     """
-    import torch
-
-    from vd.policy.actor import TrainedPolicy
-    from vd.policy.onnx import onnx_metadata
-    from vd.vision.acting import StudentPolicy
-    from vd.vision.alignment import Residual
-
-    if isinstance(policy, StudentPolicy):
-        raise ValueError(f"{path}: sparse convolutions are not exported to ONNX; name a {SUFFIX}")
-    interrupt.need("onnx", "onnxscript")
-    teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
-    rng = torch.Generator().manual_seed(0)
-    drawn = {"observation": torch.randn(CHECKED, teacher.num_observations, generator=rng)}
-    _export(teacher.network, drawn, ["action"], path, onnx_metadata(policy, contract))
-    if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
-        _have_exported(Residual)
-        clouds = CLOUD_M * torch.randn(2, CHECKED, POINTS, 3, generator=rng)
-        seen = clouds[1, :, : POINTS - 1]  # of another number
-        named = {"goal_points": clouds[0], "seen_points": seen}
-        outputs = [field.name for field in fields(Residual)]
-        _export(policy.alignment, named, outputs, path.with_stem(f"{path.stem}-alignment"))
-
-
-@cache
-def _have_exported(kind: type) -> None:
-    """Have exports take apart what a network returns; torch wants to be told once."""
-    import torch
-
-    torch.export.register_dataclass(kind)
-
-
-def _export(
-    network: "Module",
-    inputs: dict[str, "Tensor"],
-    outputs: list[str],
-    path: Path,
-    metadata: dict[str, str] | None = None,
-) -> None:
-    """Write a network whose inputs may have any size but the last, and compare it on these."""
     import onnx
     import torch
 
+    from vd.policy.actor import TrainedPolicy
     from vd.policy.contract import SEAL_KEY, UNSEALED, sealed
+    from vd.policy.onnx import onnx_metadata
+    from vd.vision.acting import StudentPolicy
 
-    network = network.eval().requires_grad_(False)
-    number = torch.export.Dim("environments")
-    shapes = []
-    for name, value in inputs.items():
-        sizes = {0: number}
-        for axis in range(1, value.ndim - 1):
-            sizes[axis] = torch.export.Dim(f"{name}_{axis}")
-        shapes.append(sizes)
+    if isinstance(policy, StudentPolicy) or policy.kind == "vision":
+        raise ValueError(f"{path}: what a {policy.kind} policy sees by is not exported to ONNX")
+    teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
+    network = teacher.network.eval().requires_grad_(False)
+    rng = torch.Generator().manual_seed(0)
+    observation = torch.randn(CHECKED, teacher.num_observations, generator=rng)
     # It warns of libraries that this network does not need, and of its own future.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), atomic_path(path) as temporary:
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
-            # Of one it would take the number for fixed.
-            tuple(value[:2] for value in inputs.values()),
+            (observation,),
             temporary,
-            input_names=list(inputs),
-            output_names=outputs,
-            dynamic_shapes=tuple(shapes),
+            input_names=["observation"],
+            output_names=["action"],
+            dynamic_shapes=({0: torch.export.Dim("environments")},),
             dynamo=True,
             external_data=False,
             verbose=False,
         )
         model = onnx.load(temporary)
-        onnx.helper.set_model_props(model, (metadata or {}) | {SEAL_KEY: UNSEALED.decode()})
+        metadata = onnx_metadata(policy, contract)
+        onnx.helper.set_model_props(model, metadata | {SEAL_KEY: UNSEALED.decode()})
         temporary.write_bytes(sealed(model.SerializeToString()))
         if find_spec("onnxruntime") is None:
             print(
@@ -168,23 +120,13 @@ def _export(
                 f"({interrupt.remedy('onnxruntime')})"
             )
             return
-        worst = _difference(network, inputs, temporary)
+        import onnxruntime
+
+        session = onnxruntime.InferenceSession(str(temporary), providers=["CPUExecutionProvider"])
+        (action,) = session.run(["action"], {"observation": observation.numpy()})
+        worst = float(np.abs(action - network(observation).numpy()).max())
         if not worst <= TOLERANCE:
             raise RuntimeError(
                 f"{path}: onnxruntime's outputs differ by {worst:.2g}; it is not written"
             )
         print(f"{path}: onnxruntime gives the same within {worst:.1e}")
-
-
-def _difference(network: "Module", inputs: dict[str, "Tensor"], path: Path) -> float:
-    """Largest difference of an output between torch and onnxruntime."""
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    arrays = {name: value.numpy() for name, value in inputs.items()}
-    wanted: Any = network(*inputs.values())
-    tensors = vars(wanted).values() if is_dataclass(wanted) else [wanted]
-    worst = 0.0
-    for output, tensor in zip(session.run(None, arrays), tensors, strict=True):
-        worst = max(worst, float(np.abs(output - tensor.numpy()).max()))
-    return worst

@@ -49,10 +49,9 @@ class TeacherPPO(PPO):
     * actor and critic have their own learning rates (Table S1: 3e-4 and 1e-3) in one optimiser.
       rsl-rl's adaptive schedule writes one rate into every group; here it moves the actor's only,
       since the KL divergence it follows says nothing about the critic. It moves once an update, by
-      the divergence of
-      the last epoch: rsl-rl moves it in every minibatch, and since the divergence within an update
-      only accumulates, one large first step there sends the rate to its lower bound for the rest of
-      it. An update that runs away (:data:`RUNAWAY_KL`) ends early;
+      the divergence of the last epoch: rsl-rl moves it in every minibatch, and since the divergence
+      within an update only accumulates, one large first step there sends the rate to its lower
+      bound for the rest of it. An update that runs away (:data:`RUNAWAY_KL`) ends early;
     * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The
       value coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
     * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay
@@ -70,10 +69,9 @@ class TeacherPPO(PPO):
     Attributes:
         actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
             advantages, which would unlearn an actor that has learned; so it learns alone first. The
-            actor's
-            gradients go through Adam meanwhile, at a rate of zero: its first step then has moments
-                to go by,
-            where one without would move every weight by the whole rate, whatever its gradient.
+            actor's gradients go through Adam meanwhile, at a rate of zero: its first step then has
+            moments to go by. One without would move every weight by the whole rate, whatever its
+            gradient.
         samples: The latest rollout as rows, by name; observations begin with :data:`OBSERVED`.
     """
 
@@ -138,10 +136,9 @@ class TeacherPPO(PPO):
 
         Returns:
             Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl``
-                (old to
-            new policy), ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share
-            of mean actions), and ``explained_variance`` of the returns by the values of the
-            rollout.
+            (old to new policy), ``clip_fraction``, ``grad_norm`` (before clipping),
+            ``beyond_bound`` (share of mean actions), and ``explained_variance`` of the returns by
+            the values of the rollout.
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0

@@ -120,10 +120,8 @@ class TeacherRunner(TrainingLoop):
 
         The best is chosen by the curriculum's progress, then success per goal over the last two
         episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until
-            two
-        episodes are over the latest takes its place: near goals are reached first, so that early
-            rates are
-        too high and no later one would beat them.
+        two episodes are over the latest takes its place: near goals are reached first, so that
+        early rates are too high and no later one would beat them.
         """
         self._better = self.iteration > 0 and (self._best is None or self._score > self._best)
         if self._better and self.window.full:

@@ -30,9 +30,8 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
 
     Returns:
         A policy: ``act(observation)`` gives actions [N, A] for observations [N, O], torch tensors.
-            Without an
-        environment it has ``task``, for :meth:`ReorientCfg.of`, and a policy by camera does not
-        act.
+        Without an environment it has ``task``, for :meth:`ReorientCfg.of`, and a policy by camera
+        does not act.
 
     Raises:
         FileNotFoundError: There is no such file.

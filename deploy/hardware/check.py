@@ -366,9 +366,7 @@ def confirm(question: str, *, yes: bool) -> None:
         raise RuntimeError("nothing moves: not confirmed")
 
 
-def open_camera(
-    cfg: RealSenseCfg, connection: Connection, place: CameraModel, *, realistic: bool = False
-) -> "ImageSource":
+def open_camera(cfg: RealSenseCfg, connection: Connection, place: CameraModel) -> "ImageSource":
     """The depth camera, that of ROS, or one before the twin at this place.
 
     Raises:
@@ -381,7 +379,7 @@ def open_camera(
     if connection.twin is not None:
         from vd.deploy.twin.twin import TwinCamera
 
-        return TwinCamera(connection.twin, place, realistic=realistic)
+        return TwinCamera(connection.twin, place)
     return RealSense(find_device(cfg.serial), cfg)
 
 

@@ -36,8 +36,6 @@ class HandOptions:
     """Calibration file of the joints' motors; by default IDs, directions and zeros are the
     USD's.
     """
-    motor: str | None = None
-    """Model of all motors, in place of what the hand's USD says."""
     baud_rate: int = BAUD_RATE
     """Of the port."""
 
@@ -71,7 +69,7 @@ def motors_of(options: HandOptions) -> "JointMotors":
     from vd.deploy.hardware.joints import read_joints
 
     hand = load_hand(options.hand, layer=options.hand_layer)
-    return read_joints(hand, options.calibration, options.motor)
+    return read_joints(hand, options.calibration)
 
 
 @contextlib.contextmanager

@@ -156,22 +156,16 @@ class JointMotors:
         return result
 
 
-def read_joints(
-    hand: HandModel, calibration: Path | None = None, model: str | None = None
-) -> JointMotors:
+def read_joints(hand: HandModel, calibration: Path | None = None) -> JointMotors:
     """The motors of a hand.
 
     Args:
         hand: The hand, whose USD says which motors it has.
         calibration: File with their IDs, directions and zeros, which count before the USD's.
-        model: Model of all of them, which counts before the USD's.
 
     Raises:
         CalibrationError: A joint has no motor, or the calibration is none, or not one of this hand.
-        ValueError: There is no such model.
     """
-    if model is not None:
-        motor_model(model)
     entries: dict[str, _Motor] = {}
     if calibration is not None:
         entries = _read_calibration(Path(calibration), hand)
@@ -182,15 +176,15 @@ def read_joints(
             raise CalibrationError(
                 f"{hand.name}: {name} follows another joint; each needs a motor here"
             )
-        if described is None and (entry is None or model is None):
+        if described is None:
             raise CalibrationError(
                 f"{hand.path} does not say which motor turns {name}: describe motors when it is "
-                "imported (vd:motor), or give --motor and --calibration"
+                "imported (vd:motor)"
             )
-        motor = described or MotorModel(str(model), 0)
+        motor = described
         if entry is not None:
             motor = replace(motor, id=entry.id, sign=entry.sign, offset_rad=entry.offset_rad)
-        motors.append(motor if model is None else replace(motor, model=model))
+        motors.append(motor)
     return JointMotors(hand, tuple(motors))
 
 

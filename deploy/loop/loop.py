@@ -275,18 +275,23 @@ class ControlLoop:
         self._log.step(state.time_s, sent_s, joints, values, truth, found_pose)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
-            doing = f"distance {decision.distance:.2f} rad" if acting else "holding"
+            doing = "holding"
             if acting and np.isnan(decision.distance):
                 doing = "acting"
-            motors = f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A"
-            print(
-                f"goal {number + 1} | {doing}"
-                + (f", true {truth[-1]:.2f}" if truth else "")
-                + f" | loop {1e3 * times.sent_s:.0f} ms | missed {self._pacer.missed}"
-                + motors * bool(np.isfinite(state.temperature).all()),
-                file=sys.stderr,
-                flush=True,
-            )
+            elif acting:
+                doing = f"distance {decision.distance:.2f} rad"
+            if truth:
+                doing += f", true {truth[-1]:.2f}"
+            parts = [
+                f"goal {number + 1}",
+                doing,
+                f"loop {1e3 * times.sent_s:.0f} ms",
+                f"missed {self._pacer.missed}",
+            ]
+            if np.isfinite(state.temperature).all():
+                parts.append(f"{state.temperature.max():.0f} deg C")
+                parts.append(f"{np.abs(state.current).max():.2f} A")
+            print(" | ".join(parts), file=sys.stderr, flush=True)
 
 
 def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:

@@ -95,8 +95,6 @@ class DriveCfg(HandOptions):
     """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals,
     nearer.
     """
-    realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Give the twin's depth images the errors of a real camera."""
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
     camera_layer: Path | None = None
@@ -162,8 +160,6 @@ class DriveCfg(HandOptions):
             check_pose_options(self.pose, twin=self.twin)
         elif self.pose_frame is not None:
             raise ValueError("--pose-frame places the poses of --pose; name their source, too")
-        if self.realistic and not self.twin:
-            raise ValueError("--realistic is for --twin")
         if Path(self.object).suffix.lower() in SCAN_SUFFIXES and (self.twin or self.pose):
             who = "a twin cannot hold" if self.twin else "a teacher does not know"
             raise ValueError(f"--object {self.object}: {who} a scan; vd-assets import it first")
@@ -363,7 +359,7 @@ def _camera(
         raise ValueError(
             f"{hand.name}'s file does not say where the camera is: --camera-layer (of vd-deploy calibrate)"
         )
-    camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
+    camera = open_camera(cfg.camera, connection, runner.camera)
     where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
     runner.look_by(camera.intrinsics.seen_from(where))
     fps = cfg.camera.fps if connection.twin is None else runner.task.sim.control_hz

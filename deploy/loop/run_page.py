@@ -1,7 +1,7 @@
 """What came of each goal of a run, from its log: in lines, and as a page with the film."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -31,13 +31,13 @@ class GoalResult:
     """``stopped`` by the policy, ``time limit``, ``lost`` or ``aborted``."""
     seconds: float
     """How long it was pursued [s]."""
-    predicted_rad: float | None
+    predicted_rad: float | None = None
     """Distance to the goal that the policy stopped by [rad]; None where it has none."""
-    error_rad: float | None
+    error_rad: float | None = None
     """True angle to the goal at the end, up to symmetry [rad]; None where nobody knows: on a real
     hand.
     """
-    success: bool | None
+    success: bool | None = None
     """Whether the policy stopped within the tolerance; None where nobody knows."""
     turned: float | None = None
     """Revolutions about the axis of a policy without goals; None where nobody knows."""
@@ -56,32 +56,29 @@ class GoalResult:
 def goal_results(log: HandLog) -> list[GoalResult]:
     """How each goal ended that was pursued."""
     columns = log.columns
-    stops = {stop.goal: stop for stop in log.stops}
+    outcomes = {stop.goal: stop.outcome for stop in log.stops}
     axis = log.run.get("spin_axis")
+    truth_known = "error" in columns
+    acting = columns["acting"] > 0.0
     results = []
-    for goal in np.unique(columns["goal"][columns["acting"] > 0.0]).astype(int):
-        rows = np.flatnonzero((columns["goal"] == goal) & (columns["acting"] > 0.0))
-        outcome = stops[goal].outcome if goal in stops else ABORTED
-        predicted = float(columns["distance"][rows[-1]])
-        error = None
-        turned = None
-        if "error" in columns and axis is None:
-            error = float(columns["error"][rows[-1]])
-        elif axis is not None and "error" in columns:
-            turned = revolutions(np.transpose([columns[name][rows] for name in ORIENTATION]), axis)
-        results.append(
-            GoalResult(
-                goal=int(goal),
-                outcome=outcome,
-                seconds=float(columns["t"][rows[-1]] - columns["t"][rows[0]]),
-                predicted_rad=None if np.isnan(predicted) else predicted,
-                error_rad=error,
-                success=None
-                if error is None
-                else outcome == "stopped" and error <= log.tolerance_rad,
-                turned=turned,
-            )
+    for goal in np.unique(columns["goal"][acting]).astype(int):
+        rows = np.flatnonzero(acting & (columns["goal"] == goal))
+        last = rows[-1]
+        predicted = float(columns["distance"][last])
+        result = GoalResult(
+            goal=int(goal),
+            outcome=outcomes.get(goal, ABORTED),
+            seconds=float(columns["t"][last] - columns["t"][rows[0]]),
+            predicted_rad=None if np.isnan(predicted) else predicted,
         )
+        if truth_known and axis is not None:
+            orientation = np.stack([columns[name][rows] for name in ORIENTATION], axis=1)
+            result = replace(result, turned=revolutions(orientation, axis))
+        elif truth_known:
+            error = float(columns["error"][last])
+            success = result.outcome == "stopped" and error <= log.tolerance_rad
+            result = replace(result, error_rad=error, success=success)
+        results.append(result)
     return results
 
 
@@ -138,8 +135,9 @@ def write_page(log: HandLog, results: Sequence[GoalResult], *, filmed: bool = Tr
     from vd.play.replay import film
 
     able = find_spec("imageio_ffmpeg") is not None
-    if filmed and able:
-        film(log, log.path / FILM_FILE)
+    film_path = log.path / FILM_FILE if filmed and able else None
+    if film_path is not None:
+        film(log, film_path)
     write_html(
         log.path / PAGE_FILE,
         "run.html",
@@ -147,19 +145,17 @@ def write_page(log: HandLog, results: Sequence[GoalResult], *, filmed: bool = Tr
         goals=len(log.goals),
         summary=summary_line(results, len(log.goals)),
         ending=ending(log),
-        film=log.path / FILM_FILE if filmed and able else None,
+        film=film_path,
         remedy=f"vd-play {log.path}" if able else interrupt.remedy("imageio_ffmpeg"),
-        rows=[
-            (
-                result.goal + 1,
-                result.outcome,
-                f"{result.seconds:.1f}",
-                "" if result.predicted_rad is None else f"{result.predicted_rad:.2f}",
-                "" if result.error_rad is None else f"{result.error_rad:.2f}",
-                {True: "yes", False: "no", None: ""}[result.success],
-            )
-            for result in results
-        ],
+        rows=list(map(_page_row, results)),
         tolerance_rad=f"{log.tolerance_rad:g}" if "error" in log.columns else None,
     )
     return log.path / PAGE_FILE
+
+
+def _page_row(result: GoalResult) -> tuple[object, ...]:
+    """A row of the page's table; what nobody knows is left empty."""
+    predicted = "" if result.predicted_rad is None else f"{result.predicted_rad:.2f}"
+    error = "" if result.error_rad is None else f"{result.error_rad:.2f}"
+    reached = {True: "yes", False: "no", None: ""}[result.success]
+    return result.goal + 1, result.outcome, f"{result.seconds:.1f}", predicted, error, reached

@@ -22,7 +22,7 @@ from vd.evaluate.statistics import (
 )
 from vd.logs.hand_log import HandLog, read_log
 
-COLUMNS = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+COLUMNS = ("time", "qx", "qy", "qz", "qw")
 """What an export has of each sample."""
 UNIT_TOLERANCE = 1e-2
 """Deviation of a quaternion's length from 1, above which it is none."""
@@ -44,13 +44,13 @@ class Mocap:
     """The file."""
     time_s: np.ndarray
     """Time of each sample [s], rising [T]."""
-    pose: np.ndarray
-    """Position [m] and quaternion xyzw, NaN where it was lost [T, 7]."""
+    quat: np.ndarray
+    """Orientation xyzw, NaN where it was lost [T, 4]."""
 
     @property
     def tracked(self) -> np.ndarray:
         """Where the object was tracked [T]."""
-        return np.isfinite(self.pose).all(axis=1)
+        return np.isfinite(self.quat).all(axis=1)
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class ScoreCfg:
     log: Annotated[Path, tyro.conf.Positional]
     """Folder of the log of vd-deploy."""
     mocap: Path
-    """Export of the motion capture: CSV with time [s], x, y, z [m], qx, qy, qz, qw, and tracked (1
-    or 0) if it likes; empty cells where markers were lost."""
+    """Export of the motion capture: CSV with time [s], qx, qy, qz, qw, and tracked (1 or 0) if it
+    likes; empty cells where markers were lost."""
     offset_s: float | None = None
     """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop.
     By default times are seconds since 1970."""
@@ -101,7 +101,7 @@ def read_mocap(path: Path) -> Mocap:
         lost = [float(row.get("tracked") or 1.0) < 0.5 for row in rows]
         values[lost, 1:] = np.nan
         mocap = Mocap(path, values[:, 0], values[:, 1:])
-        length = np.linalg.norm(mocap.pose[mocap.tracked, 3:], axis=1)
+        length = np.linalg.norm(mocap.quat[mocap.tracked], axis=1)
         if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
             raise ValueError("a quaternion's length is not 1; export rotations as quaternions")
     except KeyError as error:
@@ -122,12 +122,11 @@ def in_world(mocap: Mocap, *, world: tuple[float, ...], marker: tuple[float, ...
     for name, turn in (("--world", world), ("--marker", marker)):
         if not np.isfinite(turn).all() or not np.linalg.norm(turn) > 0.0:
             raise ValueError(f"{name} {turn} is no quaternion xyzw")
-    frame = Rotation.from_quat(world)
-    pose = mocap.pose.copy()
     rows = mocap.tracked
-    turn = frame * Rotation.from_quat(pose[rows, 3:]) * Rotation.from_quat(marker)
-    pose[rows] = np.concatenate([frame.apply(pose[rows, :3]), turn.as_quat()], axis=1)
-    return replace(mocap, pose=pose)
+    tracked = Rotation.from_quat(mocap.quat[rows])
+    quat = mocap.quat.copy()
+    quat[rows] = (Rotation.from_quat(world) * tracked * Rotation.from_quat(marker)).as_quat()
+    return replace(mocap, quat=quat)
 
 
 def stop_errors(
@@ -167,7 +166,7 @@ def stop_errors(
         errors[number] = np.nan
         if away_s[row] <= NEAR_S:
             goal = np.array(stop.goal_quat)
-            errors[number] = symmetric_error(mocap.pose[row, 3:], goal, symmetry)
+            errors[number] = symmetric_error(mocap.quat[row], goal, symmetry)
     return errors
 
 

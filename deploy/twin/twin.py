@@ -16,7 +16,7 @@ from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.hardware.motors import FaultlessMotors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
 
@@ -166,15 +166,13 @@ class TwinCamera:
     Args:
         twin: The twin.
         place: Lens and pose of the camera.
-        realistic: Whether its images have the errors of a real camera.
     """
 
-    def __init__(self, twin: Twin, place: CameraModel, *, realistic: bool = False):
-        sensor = DepthSensorCfg.realistic() if realistic else DepthSensorCfg()
+    def __init__(self, twin: Twin, place: CameraModel):
         self.intrinsics = place
         self._twin = twin
         self._camera = DepthCamera.of_scene(
-            twin.hand.scene, twin.hand.sim.body_q, DepthCameraCfg(points=0, sensor=sensor), place
+            twin.hand.scene, twin.hand.sim.body_q, DepthCameraCfg(points=0), place
         )
 
     def read(self, timeout_s: float) -> Frame:

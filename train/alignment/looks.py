@@ -1,7 +1,7 @@
-"""What a camera sees in simulation while a policy acts by the network that learns from it (DAgger).
+"""Looks: what a depth camera sees of an object while a policy acts by the network that is trained.
 
-The simulator knows how each object lies: whatever the network believes, and wherever that leads, is
-labelled by the truth (Ross et al. 2011). N environments, K looks kept, P points of a look. Base
+The simulator labels each look with how the object lies, so the network learns where its own
+decisions lead (DAgger, Ross et al. 2011). N environments, K looks kept, P points of a look. Base
 frame, metres.
 """
 
@@ -28,7 +28,7 @@ ENDS = ("task/reached", "task/dropped", "task/timed_out")
 
 
 class SimulatedLooks:
-    """Lets a policy act, and keeps what it saw.
+    """Lets a policy act, and keeps the latest looks: a new one takes the place of the oldest.
 
     Args:
         env: The environments.
@@ -49,18 +49,18 @@ class SimulatedLooks:
         self.cfg = cfg
         self._env = env
         self._surfaces = surfaces
-        place = surfaces.device
+        device = surfaces.device
         simulation = env.env
         scene = simulation.scene
         self._actor = CameraActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
-        self._pose = wp.to_torch(simulation.sim.body_q)[:, scene.object_body]
-        self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=place)
-        self._object = torch.tensor(np.asarray(scene.world_object), device=place)
-        self._scale = torch.tensor(np.asarray(scene.world_scale), device=place).float()
-        self._seen = torch.empty((cfg.kept, SEEN_POINTS, 3), dtype=torch.half, device=place)
-        self._poses = torch.empty((cfg.kept, 7), device=place)
-        self._envs = torch.empty(cfg.kept, dtype=torch.long, device=place)
-        self._kept = 0
+        self._object_pose = wp.to_torch(simulation.sim.body_q)[:, scene.object_body]
+        self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=device)
+        self._object_of_env = torch.tensor(np.asarray(scene.world_object), device=device)
+        self._scale_of_env = torch.tensor(np.asarray(scene.world_scale), device=device).float()
+        self._clouds = torch.empty((cfg.kept, SEEN_POINTS, 3), dtype=torch.half, device=device)
+        self._poses = torch.empty((cfg.kept, 7), device=device)
+        self._envs = torch.empty(cfg.kept, dtype=torch.long, device=device)
+        self._looks_so_far = 0
 
     @torch.no_grad()
     def collect(self, stopping: Callable[[], bool]) -> dict[str, Tensor] | None:
@@ -75,7 +75,7 @@ class SimulatedLooks:
             if stopping():
                 return None
             action = self._actor.act(observation)
-            pose = poses_in(self._base, self._pose)
+            pose = poses_in(self._base, self._object_pose)
             rows = finder.seen_now.nonzero().flatten()
             self._keep(finder.seen[rows], pose[rows], rows)
             errors.append(rotation_distance(finder.pose[rows, 0, 3:], pose[rows, 3:]))
@@ -94,14 +94,14 @@ class SimulatedLooks:
         Clouds of ``points``.
         """
         device = self._surfaces.device
-        drawn = torch.randint(min(self._kept, self.cfg.kept), (count,), device=device)
+        drawn = torch.randint(min(self._looks_so_far, self.cfg.kept), (count,), device=device)
         envs = self._envs[drawn]
         pose = self._poses[drawn]
         order = torch.randperm(self._surfaces.shape[1], device=device)
-        surfaces = self._surfaces[self._object[envs]][:, order]
-        shapes = self._scale[envs, None, None] * surfaces
+        surfaces = self._surfaces[self._object_of_env[envs]][:, order]
+        shapes = self._scale_of_env[envs, None, None] * surfaces
         turn = quaternion_matrices(pose[:, 3:])
-        seen = self._seen[drawn, :points].float()
+        seen = self._clouds[drawn, :points].float()
         return with_goals(shapes, turn, pose[:, :3], seen, near=near, scans=scans)
 
     def close(self) -> None:
@@ -109,9 +109,11 @@ class SimulatedLooks:
         self._env.env.close()
 
     def _keep(self, seen: Tensor, pose: Tensor, envs: Tensor) -> None:
-        places = torch.arange(self._kept, self._kept + len(envs), device=envs.device)
+        places = torch.arange(
+            self._looks_so_far, self._looks_so_far + len(envs), device=envs.device
+        )
         places %= self.cfg.kept
-        self._seen[places] = seen.half()
+        self._clouds[places] = seen.half()
         self._poses[places] = pose
         self._envs[places] = envs
-        self._kept += len(envs)
+        self._looks_so_far += len(envs)

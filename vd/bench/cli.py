@@ -31,7 +31,7 @@ def measured_by(device: str, packages: tuple[str, ...]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class SimCommand:
-    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
+    """Control steps per second and memory of the simulation under a policy's actions."""
 
     envs: tuple[int, ...] = (4096, 8192, 16384)
     """Numbers of environments to measure."""

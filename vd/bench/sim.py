@@ -1,4 +1,4 @@
-"""``vd-bench sim``: control steps per second, memory and start-up, all measured in one run.
+"""``vd-bench sim``: control steps per second and memory, all measured in one run.
 
 The whole step has physics, actions, observations, rewards, resets and randomisation; with a policy
 adds its network. States come from a teacher's mean actions, in contact, in the task of its
@@ -6,17 +6,13 @@ training.
 """
 
 import gc
-import importlib
-import pkgutil
 import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 
-import vd.kernels
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Levels
 from vd.envs.reorient import ReorientEnv
@@ -44,35 +40,6 @@ def seconds_per_call(
     return elapsed / calls
 
 
-def own_share(env: ReorientEnv) -> float:
-    """Share of our kernels in the device time of one control step on a GPU, by a timer around every launch.
-
-    Launched without the graph, in which the passes of a solver's loop cannot be told apart; idle
-    gaps do not count.
-    """
-    with wp.ScopedTimer(
-        "step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True
-    ) as timer:
-        env.launch_step()
-    prefixes = tuple(f"{name}_" for name in own_kernel_names())
-    ours = 0.0
-    total = 0.0
-    for result in timer.timing_results:
-        total += result.elapsed
-        if result.name.split()[-1].startswith(prefixes):  # "forward kernel NAME_HASH"
-            ours += result.elapsed
-    return ours / total
-
-
-def own_kernel_names() -> set[str]:
-    """Names of all kernels of :mod:`vd.kernels`."""
-    names = set()
-    for info in pkgutil.walk_packages(vd.kernels.__path__, "vd.kernels."):
-        module = importlib.import_module(info.name)
-        names |= {value.key for value in vars(module).values() if isinstance(value, wp.Kernel)}
-    return names
-
-
 def measure(
     cfg: ReorientCfg, device: str, *, teacher: TrainedPolicy, calls: int = 24
 ) -> dict[str, float]:
@@ -86,19 +53,11 @@ def measure(
 
     Returns:
         ``envs``; control steps/s over all of them: ``whole_step`` of the environment, and
-        ``with_policy``; ``own_kernels``: share of our kernels in the device time of a step, in [0,
-        1], and ``memory_gb`` of simulation and environment, both 0 on the CPU; ``start_s`` from an
-        empty process to the first finished step, kernels included; ``contacts_mean`` of an
-        environment at the end;
-        ``rows_max``: most constraint rows in any.
+        ``with_policy``; ``memory_gb`` of simulation and environment, 0 on the CPU.
     """
-    begin = time.perf_counter()
     on_gpu = device != "cpu"
     before = free_memory(device) if on_gpu else 0
     env = ReorientEnv(cfg, device)
-    env.step(env.action)
-    wp.synchronize_device(device)
-    start_s = time.perf_counter() - begin
     for _ in range(WARM_UP_STEPS):
         env.step(env.action)
     # Before the policy, whose network and matrix workspace are no part of the simulation.
@@ -120,17 +79,12 @@ def measure(
     policy_s = seconds_per_call(policy, calls, device)
     step_s = seconds_per_call(lambda: env.step(env.action), calls, device, before=policy)
     env.check()
-    data = env.sim.solver.mjw_data
     envs = cfg.num_envs
     return {
         "envs": envs,
         "whole_step": envs / step_s,
         "with_policy": envs / (policy_s + step_s),
-        "own_kernels": own_share(env) if on_gpu else 0.0,
         "memory_gb": memory,
-        "start_s": start_s,
-        "contacts_mean": float(data.nacon.numpy()[0]) / envs,
-        "rows_max": int(np.max(data.nefc.numpy())),
     }
 
 

@@ -107,17 +107,6 @@ def parse(
     return cfg
 
 
-def behind_command(words: Sequence[str]) -> list[str]:
-    """A command line that begins with ``--config FILE`` or ``--print-config``.
-
-    These behind the rest.
-    """
-    count = 0
-    while count < len(words) and words[count].partition("=")[0] in (CONFIG, PRINT):
-        count += 2 if words[count] == CONFIG else 1
-    return [*words[count:], *words[:count]]
-
-
 def take_config(words: Sequence[str]) -> tuple[list[str], ConfigFile | None]:
     """A command line without ``--config FILE``, and that file.
 

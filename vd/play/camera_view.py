@@ -9,16 +9,12 @@ from scipy.spatial.transform import Rotation
 
 SURFACE_COLOR = (60, 230, 120)
 """Colour of the believed surface."""
-AXIS_COLORS = ((235, 70, 60), (90, 200, 60), (70, 120, 255))
-"""Colours of its x, y and z."""
-AXIS_M = 0.06
-"""Length of the axes that are drawn [m]."""
 
 
 def camera_view(actor: Any, world: int) -> np.ndarray:
     """The depth image about the hand, near is bright.
 
-    Surface points and axes of the believed pose are drawn in.
+    Surface points are drawn in where the object is believed to be.
 
     Args:
         actor: A :class:`vd.evaluate.tracking.CameraActor` that has acted.
@@ -38,10 +34,6 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     for u, v, ahead in model.project(pose[:3] + turn.apply(actor.surface(world))):
         if ahead > 0.0:
             draw.ellipse((u - 1, v - 1, u + 1, v + 1), fill=SURFACE_COLOR)
-    ends = pose[:3] + AXIS_M * turn.as_matrix().T
-    origin, *tips = model.project(np.vstack([pose[:3], ends]))
-    for color, tip in zip(AXIS_COLORS, tips, strict=True):
-        draw.line((*origin[:2], *tip[:2]), fill=color, width=3)
     middle = model.project(actor.hand.tip_poses(actor.hand.start)[:, :3].mean(axis=0))[:2]
     half = np.array(picture.size) // 2
     corner = np.clip(middle - half / 2, 0, half).astype(int)

@@ -174,10 +174,7 @@ class Composer:
         self._flash = [(0, INK)] * cells
 
     def frame(self, pictures: Sequence[Picture], snapshots: Sequence[Snapshot]) -> np.ndarray:
-        """One frame of all cells, in a grid as square as it gets.
-
-        RGB bytes [height, width, 3], both even.
-        """
+        """One frame of all cells, in a grid as square as it gets; RGB bytes [height, width, 3]."""
         cells = list(map(self._cell, range(len(pictures)), pictures, snapshots))
         return _grid(cells, int(np.ceil(np.sqrt(len(cells)))))
 
@@ -229,15 +226,11 @@ def _font(size: int) -> Any:
 
 
 def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Tile equal pictures in rows; the last row is filled with white, and the size made even."""
-    height, width, _ = cells[0].shape
-    rows = -(-len(cells) // columns)
-    tiles = np.full((rows * columns, height, width, 3), 255, np.uint8)
-    tiles[: len(cells)] = cells
-    by_row = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2)
-    grid = by_row.reshape(rows * height, columns * width, 3)
-    padding = ((0, grid.shape[0] % 2), (0, grid.shape[1] % 2), (0, 0))
-    return np.pad(grid, padding, constant_values=255)
+    """Tile equal pictures in rows; the last row is filled with white."""
+    white = [np.full_like(cells[0], 255)] * (-len(cells) % columns)
+    tiles = [*cells, *white]
+    firsts = range(0, len(tiles), columns)
+    return np.vstack([np.hstack(tiles[first : first + columns]) for first in firsts])
 
 
 def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:

@@ -29,8 +29,6 @@ GHOST_HEIGHT = 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels
 # around it.
 CAMERA_DISTANCE = 1.25
-# Options of Newton's viewer that show something here; others are of cloth, particles, contacts.
-SHOWN_OPTIONS = ("show_visual", "show_joints", "show_com", "wireframe")
 
 
 class PlayViewer:
@@ -54,9 +52,6 @@ class PlayViewer:
         port: int = 8080,
     ):
         self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=False)
-        options = self.viewer._viewer_option_handles
-        for name in options.keys() - set(SHOWN_OPTIONS):
-            options.pop(name).remove()
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self.session = session
         self.camera = PictureCamera.for_hand(session.hand)
