@@ -20,7 +20,7 @@ import tyro
 
 from vd.command.config import require
 from vd.command.files import check_folder
-from vd.command.line import say_same_as
+from vd.command.line import flags_of, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.deploy.asking import answer, answered, ask, attended
 from vd.deploy.camera.camera import ImageSource
@@ -247,9 +247,9 @@ def _runner(cfg: DriveCfg, name: str, hand: "HandModel", item: "ObjectModel") ->
 def _say_chosen(cfg: DriveCfg, goals: int) -> None:
     """Say what a run takes that names no policy."""
     if cfg.policy is None:
-        where = ["--ros2"] if cfg.ros2 else ["--port", cfg.port] if cfg.port else ["--twin"]
-        words = (cfg.policy_name, "--hand", cfg.hand, "--object", cfg.object, *where)
-        say_same_as("vd-deploy", *words, why=f"{goals} goals")
+        words = (cfg.policy_name, "--hand", cfg.hand, "--object", cfg.object)
+        flags = flags_of(cfg, "policy", "hand", "object")
+        say_same_as("vd-deploy", *words, *flags, why=f"{goals} goals")
 
 
 def _goals(cfg: DriveCfg, item: "ObjectModel") -> list[np.ndarray]:
