@@ -461,6 +461,18 @@ def test_a_twin_that_is_told_to_freeze_stays_where_it_is(twin, turned, hand):
         np.testing.assert_allclose(twin.read_state().position, here, atol=0.1)
 
 
+def test_a_goal_sent_with_the_question_for_a_state_acts_from_its_answer_on(twin, turned, hand):
+    """As of motors; else a recording has it late by as long as the twin simulates."""
+    twin.torque(True)
+    start = turned.state(twin.read_state()).position
+    twin.write_goals(turned.to_motor(hand.start + 0.3), with_state=True)
+    twin.clock.sleep(0.1)
+    asked = turned.state(twin.read_state()).position
+    np.testing.assert_allclose(asked, start, atol=0.05)
+    twin.clock.sleep(0.1)
+    assert (turned.state(twin.read_state()).position > asked + 0.1).all()
+
+
 def test_check_of_a_twin_looks_at_its_camera(capsys):
     assert cli.main(["check", "--twin", "--wiggle", "--yes"]) == 0
     said = capsys.readouterr().out
