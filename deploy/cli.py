@@ -51,8 +51,8 @@ def _no_policy(text: str) -> str:
 
     try:
         check_names([text], [])
-    except FileNotFoundError:
-        return f"no command and no policy {text!r}; commands are {', '.join(COMMANDS)}"
+    except FileNotFoundError as error:
+        return f"no command {text!r}; commands are {', '.join(COMMANDS)}; and {error}"
     except ValueError as error:  # it has to be pulled
         return str(error)
     return ""

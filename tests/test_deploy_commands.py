@@ -5,6 +5,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -275,7 +277,7 @@ def plan(tmp_path, hand):
     return folder
 
 
-def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path, capsys):
+def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path, capsys, monkeypatch):
     out = tmp_path / "rec"
     first = record.RecordCfg(
         port=PORT,
@@ -314,8 +316,24 @@ def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path, capsys)
     assert wave.temperature is not None and wave.pwm is None
     assert {motor.get("position_p_gain") for motor in line.motors} == {200}
     assert not any(motor.get("torque_enable") for motor in line.motors)
+    monkeypatch.setattr(record, "connect", None)  # refused before a twin or a port is started
     with pytest.raises(record.RecordError, match="choose another"):
         record.record(replace(first, fingers=(1,)))
+
+
+def test_nothing_but_the_fault_is_said_of_a_port_that_is_not_there():
+    """Another process, since the tests' own keeps Warp quiet."""
+    words = ["-m", "vd.deploy.cli", "record", "--port", "/dev/none", "--fingers", "0"]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert done.returncode == 1 and not done.stdout
+    starting, fault = done.stderr.splitlines()
+    assert "starting" in starting and "cannot open /dev/none: there is no such device" in fault
+
+
+def test_a_misspelt_policy_is_told_those_that_are_there(capsys):
+    assert cli.main(["dclaw44", "--twin"]) == 1
+    said = capsys.readouterr().err
+    assert "no command 'dclaw44'" in said and "calibrate" in said and "dclaw4-tracking" in said
 
 
 def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
@@ -441,6 +459,18 @@ def test_a_twin_that_is_told_to_freeze_stays_where_it_is(twin, turned, hand):
         here = twin.read_state().position
         twin.clock.sleep(0.2)
         np.testing.assert_allclose(twin.read_state().position, here, atol=0.1)
+
+
+def test_a_goal_sent_with_the_question_for_a_state_acts_from_its_answer_on(twin, turned, hand):
+    """As of motors; else a recording has it late by as long as the twin simulates."""
+    twin.torque(True)
+    start = turned.state(twin.read_state()).position
+    twin.write_goals(turned.to_motor(hand.start + 0.3), with_state=True)
+    twin.clock.sleep(0.1)
+    asked = turned.state(twin.read_state()).position
+    np.testing.assert_allclose(asked, start, atol=0.05)
+    twin.clock.sleep(0.1)
+    assert (turned.state(twin.read_state()).position > asked + 0.1).all()
 
 
 def test_check_of_a_twin_looks_at_its_camera(capsys):

@@ -332,12 +332,14 @@ def test_a_teacher_that_knows_no_pose_holds_still():
         ("--pose-frame 0 0 0 0 0 0 1 --twin", "--pose-frame places the poses of --pose"),
         ("--pose ros2:/pose --twin", "--pose ros2 needs rclpy: source the setup.bash"),
         ("--pose tags --object a.ply --port /dev/null", "a teacher does not know a scan"),
+        ("--pose tags --twin --camera-layer gone.usda", "gone.usda: no camera layer"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_moves(
+def test_what_cannot_be_is_refused_before_anything_starts(
     flags, said, capsys, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("vd.deploy.loop.run.connect", None)
     (tmp_path / "a.ply").write_text("ply")
     assert cli.main(["dclaw3", "--hand", "dclaw3", *flags.split()]) == 1
     assert re.search(said, capsys.readouterr().err)

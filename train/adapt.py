@@ -9,7 +9,7 @@ import tyro
 
 from vd.command.config import require
 from vd.command.device import resolve_device
-from vd.command.line import parse, say_same_as
+from vd.command.line import flags_of, parse, say_same_as
 from vd.envs.cfg import CurriculumCfg, LevelCfg, LooseCfg
 from vd.evaluate.conditions import EXACT
 from vd.policy.agents import (
@@ -139,12 +139,7 @@ def with_defaults(cfg: AdaptCfg) -> AdaptCfg:
             max_minutes=cfg.max_minutes or CPU_MINUTES,
         )
     if full != cfg and is_main():
-        words = [policy, "--hand-layer", layer]
-        for name in ("objects", "num_envs", "max_minutes"):
-            if value := getattr(full, name):
-                words += [f"--{name.replace('_', '-')}"]
-                words += value if isinstance(value, tuple) else [value]
-        say_same_as("vd-train", "adapt", *words, "--out", cfg.out)
+        say_same_as("vd-train", "adapt", policy, *flags_of(full, "policy"))
     return full
 
 

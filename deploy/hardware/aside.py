@@ -8,6 +8,7 @@ import functools
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
+from vd.command.warp_quiet import quiet_warp
 
 ASIDE = 0.8
 """How far a finger swings one of its joints aside, and how far motions go, as a share of half the
@@ -59,6 +60,7 @@ class _Touching:
     def __init__(self, hand: HandModel):
         import mujoco
 
+        quiet_warp()
         from vd.sim.cfg import SimCfg
         from vd.sim.engine import make_solver
         from vd.sim.scene import build_hand, new_builder

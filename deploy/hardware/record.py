@@ -294,13 +294,13 @@ def record(cfg: RecordCfg) -> int:
     check_folder(cfg.out)
     motors = motors_of(cfg)
     joints = joints_of(motors.hand, cfg.fingers)
+    recording = _begun(cfg, motors, joints)
     if cfg.plan is None:
         motions = motions_of(motors, cfg.fingers, cfg.excitations)
     else:
         motions = read_plan(cfg.plan, motors)
     physics_hz = TWIN_JOINT_HZ / motors.hand.num_joints
     with connect(cfg, physics_hz=physics_hz) as connection, undisturbed(cfg.realtime):
-        recording = _begun(cfg, connection, joints)
         done = {trajectory.file for trajectory in recording.trajectories}
         left = [motion for motion in motions if motion.file not in done]
         print(
@@ -362,12 +362,12 @@ def _session(
             keep(trajectory)
 
 
-def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
+def _begun(cfg: RecordCfg, motors: "JointMotors", joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
     from vd.assets_usd.hands import called
     from vd.logs.recording import Recording, read_recording
 
-    model = called(connection.hand)
+    model = called(motors.hand)
     if (cfg.out / "recording.json").exists():
         begun = read_recording(cfg.out)
         if begun.joints != joints or begun.model != model:
@@ -375,4 +375,4 @@ def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "
                 f"{cfg.out} is of {begun.model}, {', '.join(begun.joints)}; choose another --out"
             )
         return begun
-    return Recording(cfg.out, model, joints, connection.joints.servo(), RAD_PER_COUNT, ())
+    return Recording(cfg.out, model, joints, motors.servo(), RAD_PER_COUNT, ())

@@ -20,7 +20,7 @@ import tyro
 
 from vd.command.config import require
 from vd.command.files import check_folder
-from vd.command.line import say_same_as
+from vd.command.line import flags_of, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.deploy.asking import answer, answered, ask, attended
 from vd.deploy.camera.camera import ImageSource
@@ -188,6 +188,7 @@ def run(cfg: DriveCfg) -> int:
     name = cfg.policy_name
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
+    frame = _pose_frame(cfg, hand)
     runner = _runner(cfg, name, hand, item)
     if runner.spin_axis is not None:
         goals = NO_GOAL
@@ -196,7 +197,7 @@ def run(cfg: DriveCfg) -> int:
     opened = connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, item=item)
     with opened as connection:
         try:
-            status = _pursue(cfg, name, runner, connection, item, goals, folder)
+            status = _pursue(cfg, name, runner, connection, item, goals, frame, folder)
         except Exception as error:  # the page says why, too
             fault = error
     try:
@@ -242,9 +243,9 @@ def _runner(cfg: DriveCfg, name: str, hand: "HandModel", item: "ObjectModel") ->
 def _say_chosen(cfg: DriveCfg, goals: int) -> None:
     """Say what a run takes that names no policy."""
     if cfg.policy is None:
-        where = ["--ros2"] if cfg.ros2 else ["--port", cfg.port] if cfg.port else ["--twin"]
-        words = (cfg.policy_name, "--hand", cfg.hand, "--object", cfg.object, *where)
-        say_same_as("vd-deploy", *words, why=f"{goals} goals")
+        words = (cfg.policy_name, "--hand", cfg.hand, "--object", cfg.object)
+        flags = flags_of(cfg, "policy", "hand", "object")
+        say_same_as("vd-deploy", *words, *flags, why=f"{goals} goals")
 
 
 def _goals(cfg: DriveCfg, item: "ObjectModel") -> list[np.ndarray]:
@@ -263,6 +264,7 @@ def _pursue(
     connection: Connection,
     item: "ObjectModel",
     goals: list[np.ndarray],
+    frame: np.ndarray,
     folder: Path,
 ) -> int:
     """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
@@ -286,7 +288,7 @@ def _pursue(
             stack.callback(camera.close)
         poses = None
         if cfg.pose is not None:
-            poses = stack.enter_context(_poses(cfg, cfg.pose, connection))
+            poses = stack.enter_context(_poses(cfg, cfg.pose, connection, frame))
             looks = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
@@ -380,15 +382,21 @@ def _log(
     return LogWriter(folder, hand, description, servo=servo, truth=truth, without=without)
 
 
+def _pose_frame(cfg: DriveCfg, hand: "HandModel") -> np.ndarray:
+    """Pose of the frame of --pose in the hand's base [7]; a twin's truth needs none."""
+    from vd.deploy.pose.open import NO_MOTION, pose_options, source_frame
+
+    if cfg.pose is None or pose_options(cfg.pose).kind == "sim":
+        return NO_MOTION
+    return source_frame(hand, cfg.pose_frame, cfg.camera_layer)
+
+
 def _poses(
-    cfg: DriveCfg, source: str, connection: Connection
+    cfg: DriveCfg, source: str, connection: Connection, in_base: np.ndarray
 ) -> "AbstractContextManager[tuple[PoseSource, np.ndarray]]":
     """What --pose names, with the pose of its frame in the world; a twin shows its object."""
-    from vd.deploy.pose.open import NO_MOTION, open_poses, pose_options, source_frame
+    from vd.deploy.pose.open import open_poses
 
-    in_base = NO_MOTION
-    if pose_options(source).kind != "sim":
-        in_base = source_frame(connection.hand, cfg.pose_frame, cfg.camera_layer)
     if connection.twin is not None:
         connection.twin.place_object()
     return open_poses(

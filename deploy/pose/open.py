@@ -105,8 +105,8 @@ def source_frame(
         return frame
     if camera_layer is None and hand.mounted_camera is None:
         raise ValueError(
-            f"{hand.name} has no camera: --camera-layer (of vd-deploy calibrate) or --pose-frame X Y Z "
-            "QX QY QZ QW says where the frame of the poses is in the hand's base"
+            f"{hand.name} has no camera: --pose-frame X Y Z QX QY QZ QW says where the frame of the "
+            "poses is in the hand's base; a run is told by --camera-layer, too (vd-deploy calibrate)"
         )
     if camera_layer is not None:
         return read_camera_pose(hand, camera_layer)

@@ -52,6 +52,7 @@ class Twin(FaultlessMotors):
         """The hand, where it was when it was last asked."""
         self._joints = joints
         self._goals = joints.hand.start
+        self._sent = self._goals
         self._on = np.zeros(len(self.ids), dtype=bool)
         self._share = np.ones(len(self.ids))
         self._amperes = joints.gear * np.array([model.torque_nm_per_a for model in joints.models])
@@ -69,6 +70,11 @@ class Twin(FaultlessMotors):
         self._now_s = now_s
         return now_s
 
+    def _arrive(self) -> None:
+        """Have the goals that were sent act from now on."""
+        self._goals = self._sent
+        self._drive()
+
     def _drive(self) -> None:
         """Have goals, torque and gains act from now on."""
         self.hand.drive(self._goals, self._on * self._share, self._effort)
@@ -77,6 +83,7 @@ class Twin(FaultlessMotors):
         """The state of the present."""
         with self._lock:
             now_s = self._catch_up()
+            self._arrive()
             q, qd, torque = self.hand.read()
         joints = self._joints
         count = len(self.ids)
@@ -93,11 +100,12 @@ class Twin(FaultlessMotors):
         )
 
     def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
-        """Drive to these angles of the motors [rad] from now on."""
+        """Drive to these angles of the motors [rad] from now on, or from the next state on."""
         with self._lock:
-            self._catch_up()
-            self._goals = self._joints.to_joint(_counted(goals, RAD_PER_COUNT))
-            self._drive()
+            self._sent = self._joints.to_joint(_counted(goals, RAD_PER_COUNT))
+            if not with_state:
+                self._catch_up()
+                self._arrive()
 
     def freeze(self) -> None:
         """Hold where the joints are."""
@@ -115,9 +123,9 @@ class Twin(FaultlessMotors):
         with self._lock:
             self._catch_up()
             begun = self._chosen(ids) & ~self._on if on else np.zeros(len(self.ids), dtype=bool)
-            self._goals = np.where(begun, self.hand.read()[0], self._goals)
+            self._sent = np.where(begun, self.hand.read()[0], self._sent)
             self._on[self._chosen(ids)] = on
-            self._drive()
+            self._arrive()
         return {}
 
     def _chosen(self, ids: Sequence[int] | None) -> np.ndarray:

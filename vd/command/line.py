@@ -182,6 +182,26 @@ def _set_already(default: Any, words: Sequence[str]) -> set[str]:
     return flags
 
 
+def flags_of(settings: Any, *without: str) -> list[str]:
+    """The flags that ask for settings which are not their defaults.
+
+    Args:
+        settings: A dataclass; groups in it are left out.
+        without: Fields that are left out.
+    """
+    words = list[str]()
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if field.name in without or field.default in (value, dataclasses.MISSING):
+            continue
+        flag = field.name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else [value])]
+    return words
+
+
 def say_same_as(*words: object, why: str = "") -> None:
     """Say, as a command line that does the same, what a command takes where flags are left out."""
     note = f"   ({why})" if why else ""
