@@ -42,7 +42,7 @@ LONG = {
     "vd-train alignment": "vd.train.stages.train_stage",
     "vd-train alignment --stage 1": "vd.train.stages.train_stage",
     "vd-train adapt": "vd.train.adapt._adapt",
-    "vd-train adapt --episodes 2 --seed 3": "vd.train.adapt._adapt",
+    "vd-train adapt --steps 900 --seed 3": "vd.train.adapt._adapt",
     "vd-train tracker": "vd.train.tracker._track",
     "vd-deploy --twin": "vd.deploy.loop.policy_runner.load_runner",
     "vd-deploy --hand dclaw3": "vd.deploy.loop.policy_runner.load_runner",
@@ -65,7 +65,7 @@ TAKEN = {
     "vd-train alignment": "--stage 0 --preset cpu-demo --teacher dclaw4-cube --out runs/alignment/cpu",
     "vd-train alignment --stage 1": "--preset cpu-demo --teacher dclaw4-cube --init dclaw4-vision",
     "vd-train adapt": "adapt dclaw3 --hand-layer gap/identified.usda --objects cube --num-envs 256",
-    "vd-train adapt --episodes 2 --seed 3": "--max-minutes 7.0 --episodes 2 --seed 3",
+    "vd-train adapt --steps 900 --seed 3": "--steps 900 --max-minutes 7.0 --seed 3",
     "vd-train tracker": "tracker dclaw4 --objects procedural-heldout-8-seed0 --episodes 64",
     "vd-deploy --twin": "dclaw3-vision --hand dclaw3 --object cube --twin   (3 goals)",
     "vd-deploy --hand dclaw3": "dclaw3-vision --hand dclaw3 --object cube --port {}/ttyUSB0",
@@ -76,7 +76,7 @@ TAKEN = {
     "vd-eval --hand dclaw3": "vd-eval dclaw3 --objects cube",
     "vd-play": "vd-play dclaw4 --objects cube",
     "vd-play --hand dclaw3": "vd-play dclaw3 --objects cube",
-    "vd-gap run REC": "vd-gap run REC --out gap",
+    "vd-gap run REC": "vd-gap run REC",
 }
 """What each command then says."""
 

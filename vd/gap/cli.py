@@ -11,7 +11,7 @@ import tyro
 from vd.command import interrupt
 from vd.command.device import warp_device
 from vd.command.files import check_folder
-from vd.command.line import parse, say_same_as
+from vd.command.line import flags_of, parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.gap.contact_cli import Contact
 from vd.gap.convert import Convert
@@ -65,15 +65,9 @@ class _Step:
         """Run the steps, and print the verdict or the file that the last one wrote."""
         analysis = self.analysis()
         if self.hand is None:
-            words = () if analysis.hand_name is None else ("--hand", analysis.hand_name)
-            say_same_as(
-                "vd-gap",
-                self.first if self.first == self.last else "run",
-                self.recording,
-                *words,
-                "--out",
-                self.out,
-            )
+            step = self.first if self.first == self.last else "run"
+            full = replace(self, hand=analysis.hand_name)
+            say_same_as("vd-gap", step, self.recording, *flags_of(full, "recording"))
         analysis.run(self.last, first=self.first, fresh=self.fresh or self.first == "report")
         if self.last == "report":
             _print_report(analysis)
