@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from vd.command.line import flags_of, parse
+from vd.deploy.loop.run import DriveCfg
 from vd.train.alignment.cli import ALIGNMENT
 from vd.train.flags import parse_teacher
 from vd.train.presets import PRESETS
@@ -108,3 +110,13 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     assert "epochs: 3" in run(f"vd-train teacher --print-config --config={path}")[1]
     path.write_text("stage: 1\npreset: cpu-demo")
     assert parse_stage(ALIGNMENT, ["--config", str(path)]).run.out.name == "cpu-stage1"
+
+
+def test_flags_ask_for_the_settings_that_they_were_made_of():
+    """Those of groups, too, and values that look like flags."""
+    typed = "--twin --pose sim --no-realtime --pose-frame -1 0 0 0 0 0 1 --safety.misses 12"
+    asked = parse(DriveCfg, [*typed.split(), "--ros2-args=-r a:=/b"], prog="vd-deploy")
+    flags = flags_of(asked)
+    assert parse(DriveCfg, flags, prog="vd-deploy") == asked
+    assert "--ros2-args=-r a:=/b" in flags and "--safety.misses" in flags
+    assert flags_of(parse(DriveCfg, [], prog="vd-deploy")) == []

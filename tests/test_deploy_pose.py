@@ -333,6 +333,7 @@ def test_a_teacher_that_knows_no_pose_holds_still():
         ("--pose ros2:/pose --twin", "--pose ros2 needs rclpy: source the setup.bash"),
         ("--pose tags --object a.ply --port /dev/null", "a teacher does not know a scan"),
         ("--pose tags --twin --camera-layer gone.usda", "gone.usda: no camera layer"),
+        ("--twin --camera-layer gone.usda", "gone.usda: no camera layer"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_starts(

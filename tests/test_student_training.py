@@ -211,10 +211,11 @@ def test_losses_are_least_at_the_truth(tmp_path):
     torch.testing.assert_close(believed.position + position, truth.position)
     sequences = next(trainer.source.sequences())
     label = torch.full_like(sequences.label, 0.3)
-    for weight in trainer.network.action.parameters():
-        weight.data.zero_()
-    acted = trainer.act(replace(sequences, label=label), 0.0)
-    assert float(acted["loss/action"]) == pytest.approx(0.09)
+    for wrong, loss in ((0.0, 0.0), (0.1, 0.01)):
+        trainer.network.action.weight.data.zero_()
+        trainer.network.action.bias.data.fill_(0.3)
+        acted = trainer.act(replace(sequences, label=label - wrong), 0.0)
+        assert float(acted["loss/action"]) == pytest.approx(loss, abs=1e-6)
     trainer.close()
 
 

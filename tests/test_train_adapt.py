@@ -1,5 +1,6 @@
 """vd-train adapt: what it takes over of a policy, what it refuses, and how it ends."""
 
+import shlex
 from dataclasses import replace
 
 import pytest
@@ -24,7 +25,7 @@ def cfg(tmp_path) -> AdaptCfg:
         name: {"command_delay": {"delay_s": (0.08, 0.07, 0.09)}} for name in hand.joint_names
     }
     write_layer(layer, hand, baseline={}, effects=effects, tool="a test", recording="none")
-    return AdaptCfg(policy="dclaw4", hand_layer=layer, out=tmp_path / "run", objects=("cube",))
+    return AdaptCfg(policy="dclaw4", hand_layer=layer, out=tmp_path / "a run", objects=("cube",))
 
 
 def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone(cfg):
@@ -49,7 +50,8 @@ def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone
 def test_it_ends_with_the_line_that_compares_before_and_after(cfg, monkeypatch, capsys):
     monkeypatch.setattr("vd.train.adapt.train", lambda run, say: 0)
     assert adapt._adapt(cfg) == 0
-    line = capsys.readouterr().out.partition("compare: vd-eval ")[2].split()
-    compared = parse(EvalCfg, line, prog="vd-eval")
+    line = capsys.readouterr().out.partition("compare: vd-eval ")[2]
+    compared = parse(EvalCfg, shlex.split(line), prog="vd-eval")
+    assert (compared.objects, compared.seed) == (cfg.objects, cfg.seed)
     assert compared.policies == ("dclaw4", policy_at(cfg.out))
     assert compared.hand_layer == str(cfg.hand_layer)

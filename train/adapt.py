@@ -1,5 +1,6 @@
 """``vd-train adapt``: train a teacher further in an identified model of its hand."""
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -107,7 +108,9 @@ def _adapt(cfg: AdaptCfg) -> int:
     with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
         status = train(run, say)
     if status == 0 and not cfg.smoke:
-        say(f"compare: vd-eval {cfg.policy} {policy_at(cfg.out)} --hand-layer {cfg.hand_layer}")
+        words = ["vd-eval", cfg.policy, policy_at(cfg.out), "--hand-layer", cfg.hand_layer]
+        words += ["--objects", *run.env.objects, "--seed", cfg.seed]
+        say(f"compare: {shlex.join(map(str, words))}")
     return status
 
 

@@ -226,8 +226,8 @@ class Demo:
         return {
             "policy": self.policy,
             "sees": "vision" if self.policy.endswith("vision") else "tracking",
-            "meshes": self.cfg.meshes,
-            "built_in": len(self.objects) > 1 or self.cfg.meshes is None,
+            "meshes": None if self.objects[0] == HELD_OUT.format(SHOWN) else self.cfg.meshes,
+            "built_in": len(self.objects) > 1,
             "film": film,
             "rows": lines,
             "tolerance_rad": PAPER.success.rotation_rad,

@@ -177,6 +177,7 @@ def run(cfg: DriveCfg) -> int:
     check_folder(folder)
     if is_log(folder):
         raise FileExistsError(f"{folder} holds a log; choose another folder")
+    from vd.assets_usd.camera_layer import read_camera
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import one_object
@@ -188,6 +189,8 @@ def run(cfg: DriveCfg) -> int:
     name = cfg.policy_name
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
+    if cfg.camera_layer is not None:
+        read_camera(hand, cfg.camera_layer)  # a wrong one is refused before anything is started
     frame = _pose_frame(cfg, hand)
     runner = _runner(cfg, name, hand, item)
     if runner.spin_axis is not None:

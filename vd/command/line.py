@@ -182,23 +182,29 @@ def _set_already(default: Any, words: Sequence[str]) -> set[str]:
     return flags
 
 
-def flags_of(settings: Any, *without: str) -> list[str]:
+def flags_of(settings: Any, *without: str, group: str = "") -> list[str]:
     """The flags that ask for settings which are not their defaults.
 
     Args:
-        settings: A dataclass; groups in it are left out.
+        settings: A dataclass, with groups in it.
         without: Fields that are left out.
+        group: Begin of the flags' names.
     """
     words = list[str]()
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        if field.name in without or field.default in (value, dataclasses.MISSING):
+        flag = group + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            words += flags_of(value, group=f"{flag}.")
+        elif field.name in without or field.default in (value, dataclasses.MISSING):
             continue
-        flag = field.name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif isinstance(value, bool):
+            words.append(f"--{group}{'' if value else 'no-'}{flag.removeprefix(group)}")
+        elif isinstance(value, tuple):
+            words += [f"--{flag}", *map(str, value)]
         else:
-            words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else [value])]
+            text = str(value)  # one that begins as a flag does is no value but behind =
+            words += [f"--{flag}={text}"] if text.startswith("-") else [f"--{flag}", text]
     return words
 
 

@@ -208,7 +208,7 @@ class Analysis:
     @cached_property
     def _made_from(self) -> str:
         """Digest of everything that the steps are made from."""
-        settings = to_dict(replace(self.settings, recording=Path()))
+        settings = to_dict(replace(self.settings, recording=Path(), hand=self.hand_name))
         digest = hashlib.sha256(json.dumps([METHOD, settings]).encode())
         recording = self.recording
         digest.update((recording.path / "recording.json").read_bytes())

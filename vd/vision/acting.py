@@ -158,7 +158,7 @@ class ActingStudent:
         angle = turn_angle(self.belief.rotation.mT @ goal)
         return CameraDecision(
             action=decision.action,
-            angle=angle.masked_fill(self.lost, torch.nan),
+            angle=angle.masked_fill(self.lost, torch.pi),  # or what was never seen would be stopped
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),
             voxels=look.voxels,
