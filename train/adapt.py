@@ -108,7 +108,13 @@ def _adapt(cfg: AdaptCfg) -> int:
     with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
         status = train(run, say)
     if status == 0 and not cfg.smoke:
-        words = ["vd-eval", cfg.policy, policy_at(cfg.out), "--hand-layer", cfg.hand_layer]
+        words: list[object] = [
+            "vd-eval",
+            cfg.policy,
+            policy_at(cfg.out),
+            "--hand-layer",
+            cfg.hand_layer,
+        ]
         words += ["--objects", *run.env.objects, "--seed", cfg.seed]
         say(f"compare: {shlex.join(map(str, words))}")
     return status
