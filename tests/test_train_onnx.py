@@ -1,5 +1,7 @@
 """The networks of policies as ONNX."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 import torch
@@ -32,6 +34,17 @@ def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, n
 def test_a_policy_that_sees_by_a_network_is_refused(tmp_path, capsys):
     assert main(["export", "dclaw4-vision", str(tmp_path / "policy.onnx")]) == 1
     assert "vision" in capsys.readouterr().err
+    assert not (tmp_path / "policy.onnx").exists()
+
+
+def test_what_an_export_needs_is_named_before_it_begins(tmp_path, capsys, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec",
+        lambda name, *a: None if name == "onnxscript" else find(name, *a),
+    )
+    assert main(["export", "dclaw4", str(tmp_path / "policy.onnx")]) == 1
+    assert "onnxscript is not installed: " in capsys.readouterr().err
     assert not (tmp_path / "policy.onnx").exists()
 
 

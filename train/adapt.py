@@ -108,15 +108,9 @@ def _adapt(cfg: AdaptCfg) -> int:
     with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
         status = train(run, say)
     if status == 0 and not cfg.smoke:
-        words: list[object] = [
-            "vd-eval",
-            cfg.policy,
-            policy_at(cfg.out),
-            "--hand-layer",
-            cfg.hand_layer,
-        ]
-        words += ["--objects", *run.env.objects, "--seed", cfg.seed]
-        say(f"compare: {shlex.join(map(str, words))}")
+        policies = [str(cfg.policy), policy_at(cfg.out)]
+        where = ["--hand-layer", str(cfg.hand_layer), "--objects", *run.env.objects]
+        say(f"compare: {shlex.join(['vd-eval', *policies, *where, '--seed', str(cfg.seed)])}")
     return status
 
 

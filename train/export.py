@@ -81,7 +81,6 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
         RuntimeError: Outputs differ by more than rounding.
         ValueError: It sees by a network, which is not exported.
     """
-    import onnx
     import torch
 
     from vd.policy.actor import TrainedPolicy
@@ -91,6 +90,9 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
 
     if isinstance(policy, StudentPolicy) or policy.kind == "vision":
         raise ValueError(f"{path}: what a {policy.kind} policy sees by is not exported to ONNX")
+    interrupt.need("onnx", "onnxscript")
+    import onnx
+
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
     network = teacher.network.eval().requires_grad_(False)
     rng = torch.Generator().manual_seed(0)
