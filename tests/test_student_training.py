@@ -172,6 +172,24 @@ def test_beliefs_begin_about_where_objects_are(stage, tmp_path):
     trainer.close()
 
 
+def test_by_a_camera_half_the_looks_are_from_anywhere_as_in_a_search(tmp_path):
+    """A network without weights leaves beliefs as they are."""
+    cfg = settings(2, tmp_path, window=1, batch=64)
+    cfg = replace(cfg, simulated=replace(cfg.simulated, looks=64))
+    trainer = trainer_of(replace(cfg, task=replace(cfg.task, num_envs=64)))
+    with torch.no_grad():
+        for weight in trainer.network.parameters():
+            weight.zero_()
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    looks = next(trainer.source.looks(trainer.acting))
+    turn, _ = belief_errors(looks.sight.belief, looks.truth)
+    farther = (turn > made.AWAY_RAD + 1e-3).float().mean()
+    # Of rotations uniform on SO(3) so many are farther; 0.1 is four deviations.
+    share = 1.0 - (made.AWAY_RAD - np.sin(made.AWAY_RAD)) / np.pi
+    assert farther == pytest.approx(0.5 * share, abs=0.1)
+    trainer.close()
+
+
 def test_errors_of_beliefs_are_as_large_and_last_as_they_are_said_to():
     torch.manual_seed(0)
     envs = 4000

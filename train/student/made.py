@@ -45,6 +45,27 @@ def off(truth: Belief) -> Belief:
     return Belief(turned(truth.rotation, AWAY_RAD), truth.position + shift)
 
 
+@torch.no_grad()
+def sought(acting: ActingStudent, senses: Senses, truth: Belief, rows: Tensor) -> Looks:
+    """Looks as of a search: at beliefs that begin at any rotation, and were made better some times.
+
+    By them what is far off comes to be doubted.
+
+    Args:
+        acting: The student.
+        senses: What was sensed [R].
+        truth: Where the objects are, base frame [R].
+        rows: Environment of each, int64 [R].
+    """
+    seen = senses.points.nanmean(dim=1)
+    position = torch.where(seen.isfinite(), seen, off(truth).position)
+    belief = Belief(random_matrices(len(rows), rows.device), position)
+    for _ in range(int(torch.randint(PASSES, ()))):
+        belief, _ = acting.improved(senses, belief, rows)
+    sight = acting.build(senses, belief, rows)
+    return Looks(sight, acting.build.frames.belief_in(truth, sight.frame))
+
+
 class MadeSequences:
     """Draws looks at shapes. Each iteration has new ones.
 

@@ -24,7 +24,7 @@ from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import SimulatedCfg, StudentTrainCfg
-from vd.train.student.made import off
+from vd.train.student.made import off, sought
 from vd.train.student.sequences import Looks, Sequences, belief_errors
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
@@ -137,8 +137,11 @@ class SimulatedSequences:
             if self._camera is None:
                 looks.append(self._complete(acting, senses, pose, place))
             else:
-                some = itemgetter(self._learned())
+                followed, lost = self._learned().tensor_split(2)
+                some = itemgetter(followed)
                 looks.append(Looks(each(sight, some), each(truth, some)))
+                others = itemgetter(lost)
+                looks.append(sought(acting, each(senses, others), each(place, others), lost))
             decision = acting.decide(told, sight.frame)
             label = self.labels()
             named = acting.build.frames.joints_in(label, sight.frame)

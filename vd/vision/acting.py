@@ -121,13 +121,17 @@ class ActingStudent:
             position = senses.points[some].nanmean(dim=1)
             belief = Belief(rotation.flatten(0, 1), position.repeat_interleave(starts, dim=0))
             for _ in range(PASSES):
-                sight = self.build(now, belief, every)
-                look = self.network.look(sight)
-                belief = self.build.frames.belief_out(look.belief, sight.frame)
-            best = look.doubt.unflatten(0, (-1, starts)).argmin(dim=1)
+                belief, doubt = self.improved(now, belief, every)
+            best = doubt.unflatten(0, (-1, starts)).argmin(dim=1)
             chosen = torch.arange(len(some), device=some.device) * starts + best
             self.belief.rotation[some] = belief.rotation[chosen]
             self.belief.position[some] = belief.position[chosen]
+
+    def improved(self, senses: Senses, belief: Belief, rows: Tensor) -> tuple[Belief, Tensor]:
+        """Better beliefs than ``belief`` of the hands ``rows``, and how much they are doubted [R]."""
+        sight = self.build(senses, belief, rows)
+        look = self.network.look(sight)
+        return self.build.frames.belief_out(look.belief, sight.frame), look.doubt
 
     def see(self, sight: StudentInput) -> Look:
         """What the network sees; where the object then is believed to be is kept."""
