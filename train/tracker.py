@@ -15,7 +15,7 @@ import tyro
 
 from vd.command.device import resolve_device
 from vd.command.files import check_file
-from vd.command.line import parse, say_same_as
+from vd.command.line import flags_of, parse, say_same_as
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
 from vd.paper import PAPER
@@ -90,7 +90,8 @@ def with_defaults(cfg: TrackerCfg) -> TrackerCfg:
     episodes = cfg.episodes or (64 if few else 256)
     if not (cfg.objects and cfg.episodes):
         words = (cfg.teacher, "--objects", *objects, "--episodes", episodes, "--out", cfg.out)
-        say_same_as("vd-train", "tracker", *words)
+        flags = flags_of(cfg, "teacher", "objects", "episodes", "out")
+        say_same_as("vd-train", "tracker", *words, *flags)
     return replace(cfg, objects=objects, episodes=episodes)
 
 

@@ -6,7 +6,7 @@ from itertools import chain
 
 from vd.command import interrupt
 from vd.command.files import check_file, check_folder
-from vd.command.line import parse, say_same_as
+from vd.command.line import flags_of, parse, say_same_as
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
 from vd.policy.agents import check_names
@@ -22,7 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_folder(cfg.out)
         if not (cfg.policies or cfg.suite):
             words = (*cfg.agent_names, "--objects", *cfg.object_sets, "--episodes", cfg.episodes)
-            say_same_as("vd-eval", *words, "--out", cfg.out)
+            flags = flags_of(cfg, "policies", "objects", "episodes", "out")
+            say_same_as("vd-eval", *words, "--out", cfg.out, *flags)
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
         else:

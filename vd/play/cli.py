@@ -16,7 +16,7 @@ from vd.command import interrupt
 from vd.command.config import require
 from vd.command.device import resolve_device
 from vd.command.files import check_file
-from vd.command.line import parse, say_same_as
+from vd.command.line import flags_of, parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.logs.hand_log import is_log
@@ -71,7 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg.validate()
     if not cfg.policy:
         cfg = replace(cfg, policy=default_policy(cfg.hand or DEFAULT_HAND, "teacher"))
-        say_same_as("vd-play", cfg.policy, "--objects", *cfg.objects, "--port", cfg.port)
+        words = (cfg.policy, "--objects", *cfg.objects, "--port", cfg.port)
+        say_same_as("vd-play", *words, *flags_of(cfg, "policy", "objects", "port"))
     if cfg.video is not None:
         interrupt.need("imageio_ffmpeg")
         check_file(cfg.video)
