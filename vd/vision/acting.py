@@ -12,6 +12,7 @@ from vd.geometry.quaternions import product, rotated
 from vd.policy.contract import Contract, Contracted, StudentSpec
 from vd.policy.senses import CameraDecision, Senses
 from vd.vision.inputs import Belief, InputBuilder, StudentInput, each
+from vd.vision.rivals import RIVALS, Rivals
 from vd.vision.rotations import cube_rotations, turn_angle
 from vd.vision.student import Decision, Look, Student
 
@@ -49,7 +50,7 @@ class ActingStudent:
 
     Where an episode begins, the object is looked for as soon as something is seen: from the 24
     rotations of a cube, none of which is more than 1.1 rad from any. Of the beliefs that the network
-    comes to, the one that it doubts least is followed from then on.
+    comes to, those that it doubts least are followed side by side for a while, then the best of them.
 
     Args:
         network: The network.
@@ -71,6 +72,7 @@ class ActingStudent:
         self.hidden = network.first_hidden(len(goals))
         self.lost = torch.ones(len(goals), dtype=torch.bool, device=goals.device)
         self._starts = cube_rotations(goals.device)
+        self._rivals = Rivals(len(goals), goals.device)
         mount = torch.tensor(hand.mount, dtype=torch.float32, device=goals.device)
         self._base = mount.repeat(len(goals), 1)
 
@@ -82,6 +84,7 @@ class ActingStudent:
     def forget(self, fresh: Tensor) -> None:
         """Remember nothing where an episode begins, bool [N]."""
         self.hidden = self.hidden.masked_fill(fresh[:, None], 0.0)
+        self._rivals.left = self._rivals.left.masked_fill(fresh, 0)
 
     def look(self, senses: Senses, begin: Belief | None = None) -> StudentInput:
         """What the network reads.
@@ -102,6 +105,9 @@ class ActingStudent:
         if begin is None:
             seen = torch.isfinite(senses.points).all(dim=-1).sum(dim=1) >= LEAST_SEEN
             found = (self.lost & seen).nonzero()[:, 0]
+            watched = self._rivals.left.nonzero()[:, 0]
+            if len(watched):
+                self._compare(senses, watched)
             if len(found):
                 self._search(senses, found)
             self.lost = self.lost & ~seen
@@ -122,24 +128,42 @@ class ActingStudent:
             belief = Belief(rotation.flatten(0, 1), position.repeat_interleave(starts, dim=0))
             for _ in range(PASSES):
                 belief, doubt = self.improved(now, belief, every)
-            best = doubt.unflatten(0, (-1, starts)).argmin(dim=1)
-            chosen = torch.arange(len(some), device=some.device) * starts + best
-            self.belief.rotation[some] = belief.rotation[chosen]
-            self.belief.position[some] = belief.position[chosen]
+            self._rivals.begin(some, belief, doubt)
+            self._believe_best(some)
+
+    @torch.no_grad()
+    def _compare(self, senses: Senses, rows: Tensor) -> None:
+        """Look by all rivals of the hands ``rows`` [R], and believe the least doubted until now."""
+        for some in rows.split(AT_ONCE // RIVALS):
+            every = some.repeat_interleave(RIVALS)
+            now = each(senses, itemgetter(every))
+            belief, doubt = self.improved(now, self._rivals.of(some), every)
+            self._rivals.add(some, belief, doubt)
+            self._believe_best(some)
+
+    def _believe_best(self, rows: Tensor) -> None:
+        """Believe the best rival of each of the hands ``rows`` [R]."""
+        best = self._rivals.best(rows)
+        self.belief.rotation[rows] = best.rotation
+        self.belief.position[rows] = best.position
 
     def improved(self, senses: Senses, belief: Belief, rows: Tensor) -> tuple[Belief, Tensor]:
         """Better beliefs than ``belief`` of the hands ``rows``, and how much they are doubted [R]."""
         sight = self.build(senses, belief, rows)
         look = self.network.look(sight)
-        return self.build.frames.belief_out(look.belief, sight.frame), look.doubt
+        return self._kept(look, sight), look.doubt
 
     def see(self, sight: StudentInput) -> Look:
         """What the network sees; where the object then is believed to be is kept."""
         look = self.network.look(sight)
+        self.belief = self._kept(look, sight)
+        return look
+
+    def _kept(self, look: Look, sight: StudentInput) -> Belief:
+        """What a look leaves to believe, base frame."""
         belief = self.build.frames.belief_out(look.belief, sight.frame)
         # One that strayed would have nothing in sight to come back by.
-        self.belief = self.build.near_place(belief, self.network.cfg.reach_m)
-        return look
+        return self.build.near_place(belief, self.network.cfg.reach_m)
 
     def decide(self, told: Tensor, frame: Tensor) -> Decision:
         """What the network decides by what it is told in frames, in the order of the joints.

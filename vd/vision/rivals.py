@@ -1,0 +1,84 @@
+"""Beliefs that rival each other after a first look, followed side by side for a while.
+
+One look tells little: from some sides a mug and its mirror image look alike. What is seen in the next
+steps does, so each step adds to how much each belief is doubted.
+
+N hands, K beliefs of each.
+"""
+
+import torch
+from torch import Tensor
+
+from vd.vision.inputs import Belief
+from vd.vision.rotations import turn_angle
+
+RIVALS = 4
+"""Beliefs that are followed of each hand (ours)."""
+WATCHED = 10
+"""Control steps for which they are (ours)."""
+APART_RAD = 0.5
+"""Beliefs that are less far from each other than this are one (ours). Not tuned."""
+
+
+class Rivals:
+    """Beliefs of N hands, and how much each was doubted.
+
+    Args:
+        hands: N.
+        device: Where they are.
+
+    Attributes:
+        belief: The beliefs [N, K].
+        doubt: What each was doubted in all steps together [N, K].
+        left: Steps for which those of each hand are still to be followed, int64 [N].
+    """
+
+    def __init__(self, hands: int, device: torch.device):
+        rotation = torch.eye(3, device=device).repeat(hands, RIVALS, 1, 1)
+        self.belief = Belief(rotation, torch.zeros((hands, RIVALS, 3), device=device))
+        self.doubt = torch.zeros((hands, RIVALS), device=device)
+        self.left = torch.zeros(hands, dtype=torch.int64, device=device)
+
+    def begin(self, rows: Tensor, belief: Belief, doubt: Tensor) -> None:
+        """Keep what is doubted least and is apart of what a search found.
+
+        Args:
+            rows: Hands, int64 [R].
+            belief: S beliefs of each, one hand after the other [R S].
+            doubt: How much each is doubted [R S].
+        """
+        found = of_hands(belief, rows)
+        doubt = doubt.view(len(rows), -1)
+        row = torch.arange(len(rows), device=rows.device)
+        for rival in range(RIVALS):
+            best = doubt.argmin(dim=1)
+            chosen = found.rotation[row, best]
+            self.belief.rotation[rows, rival] = chosen
+            self.belief.position[rows, rival] = found.position[row, best]
+            self.doubt[rows, rival] = doubt[row, best]
+            near = turn_angle(found.rotation.mT @ chosen[:, None]) < APART_RAD
+            doubt = doubt.masked_fill(near, torch.inf)
+        self.left[rows] = WATCHED
+
+    def add(self, rows: Tensor, belief: Belief, doubt: Tensor) -> None:
+        """What a step made of the beliefs of hands ``rows``, and how much it doubts them [R K]."""
+        better = of_hands(belief, rows)
+        self.belief.rotation[rows] = better.rotation
+        self.belief.position[rows] = better.position
+        self.doubt[rows] += doubt.view(len(rows), -1)
+        self.left[rows] -= 1
+
+    def of(self, rows: Tensor) -> Belief:
+        """The beliefs of hands ``rows`` one after the other [R K]."""
+        belief = self.belief
+        return Belief(belief.rotation[rows].flatten(0, 1), belief.position[rows].flatten(0, 1))
+
+    def best(self, rows: Tensor) -> Belief:
+        """The least doubted belief of each of hands ``rows`` [R]."""
+        least = self.doubt[rows].argmin(dim=1)
+        return Belief(self.belief.rotation[rows, least], self.belief.position[rows, least])
+
+
+def of_hands(belief: Belief, rows: Tensor) -> Belief:
+    """Beliefs one hand after the other [R S] by hand [R, S]; rows [R]."""
+    return Belief(belief.rotation.view(len(rows), -1, 3, 3), belief.position.view(len(rows), -1, 3))
