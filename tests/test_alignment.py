@@ -216,10 +216,12 @@ def make_quick_scenes():
     hands = Hands(load_hand("dclaw3"), QUICK.hands, device="cpu")
     points = CLOUDS * QUICK.points
     held_out = {
-        "made": made_shapes(4, points, hands.eye.device),
+        "made": made_shapes(4, points, hands.sides, hands.eye.device),
         "validation": centred_points(load_set(["cuboid"]), points, hands.eye.device),
     }
-    bank = ShapeBank(load_set(["cube", "cuboid"]), QUICK.shapes, points, hands.eye.device)
+    bank = ShapeBank(
+        load_set(["cube", "cuboid"]), QUICK.shapes, points, hands.sides, hands.eye.device
+    )
     return bank, held_out, hands
 
 

@@ -4,9 +4,14 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from small_scenes import REST_SPIN, SmallScene
+from test_hand_import import write_urdf
 
+from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_model import HandModel, open_stage, read_hand
 from vd.assets_usd.hands import hand_usd
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import build_hand, new_builder
 
 MOUNT = ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0, 0.0))
 """Base frame in the world: 0.25 m up, turned by pi about +y."""
@@ -88,3 +93,30 @@ def test_sites(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
     for i, link, frame in zip(sites, hand.tip_link, hand.tip_frame, strict=True):
         assert builder.shape_body[i] == link
         np.testing.assert_allclose(tuple(builder.shape_transform[i]), frame, atol=1e-6)
+
+
+@pytest.mark.parametrize("soft", [True, False])
+def test_a_light_finger_that_is_pressed_onto_an_end_rests_if_the_end_is_soft(tmp_path, soft):
+    """Driven as LEAP is; without what the import writes of ends, Newton's own rattle."""
+    (tmp_path / "said.yaml").write_text("drive: {kp: 3.0, kd: 0.2, effort: 0.28, armature: 0.0015}")
+    hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
+    if not soft:
+        lines = hand.path.read_text().splitlines()
+        hand.path.write_text("\n".join(line for line in lines if "solreflimit" not in line))
+    cfg = SimCfg()
+    world = build_hand(hand, cfg, visuals=False)
+    world.gravity = (0.0, 0.0, 0.0)
+    builder = new_builder()
+    builder.add_world(world)
+    scene = SmallScene(builder, cfg, "cpu")
+    scene.control.joint_target_q.assign((hand.lower - 0.3).astype(np.float32))
+    scene.run(2.0)
+    moved = hand.actuated
+    fastest = 0.0
+    for _ in range(60):
+        scene.run(cfg.physics_dt)
+        fastest = max(fastest, np.abs(scene.state.joint_qd.numpy()[moved]).max())
+    assert (fastest < REST_SPIN) == soft
+    if soft:
+        ends = scene.state.joint_q.numpy()[moved]
+        np.testing.assert_allclose(ends, hand.lower[moved], atol=0.01)

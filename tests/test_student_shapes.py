@@ -118,13 +118,13 @@ def test_deformed_normals_are_those_of_the_deformed_surface():
 
 
 def test_shapes_have_sizes_of_objects_and_differ():
-    meshes = torch.cat([made_shapes(3, 600, CPU) for _ in range(2)])
-    for some in (made_shapes(40, 512, CPU), mesh_shapes(meshes.half(), 40, 512)):
+    low, high = sides = 0.05, 0.12
+    meshes = torch.cat([made_shapes(3, 600, sides, CPU) for _ in range(2)])
+    for some in (made_shapes(40, 512, sides, CPU), mesh_shapes(meshes.half(), 40, 512, sides)):
         assert some.shape == (40, 512, 6) and some.isfinite().all()
         torch.testing.assert_close(
             some[..., 3:].norm(dim=-1), torch.ones(40, 512), atol=1e-3, rtol=0
         )
         side = (some[..., :3].amax(dim=1) - some[..., :3].amin(dim=1)).amax(dim=-1)
-        low, high = shapes.LENGTH_M
         assert side.min() >= low - 1e-5 and side.max() <= high + 1e-5 and side.std() > 0.01
         torch.testing.assert_close(some[..., :3].mean(dim=1), torch.zeros(40, 3), atol=1e-5, rtol=0)

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from test_hand_import import write_urdf
 
+from vd.assets_usd.hand_data import compose, invert
+from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.policy_runner import CameraRunner, Sensed
 from vd.envs.cfg import ReorientCfg
@@ -17,12 +20,14 @@ from vd.evaluate.compare import actor_of
 from vd.evaluate.trace import advance
 from vd.policy.bundle import read_policy, write_policy
 from vd.train.checkpoint import list_checkpoints
+from vd.train.cli import main as train
+from vd.train.config import StageTaskCfg
 from vd.train.student import made
 from vd.train.student.build import build_student
 from vd.train.student.config import SimulatedCfg, StudentTrainCfg, smoke
 from vd.train.student.sequences import belief_errors, flow_loss
 from vd.train.student.simulated import BeliefErrors
-from vd.vision.acting import StudentPolicy
+from vd.vision.acting import LEAST_SEEN, StudentPolicy
 from vd.vision.cfg import StudentCfg
 from vd.vision.inputs import Belief, carried
 from vd.vision.rotations import quaternion_matrices, random_rotations
@@ -63,10 +68,28 @@ def weights(trainer) -> torch.Tensor:
     return torch.nn.utils.parameters_to_vector(trainer.network.parameters()).detach().clone()
 
 
+@pytest.fixture(scope="module")
+def unlike(tmp_path_factory) -> str:
+    """A teacher of a moment's training: an imported hand of 2 and 3 motors looks up and holds cubes."""
+    folder = tmp_path_factory.mktemp("unlike")
+    (folder / "said.yaml").write_text("workspace: {size: [0.04, 0.05]}")
+    hand = import_hand(write_urdf(folder), folder / "hand", folder / "said.yaml").hand
+    out = str(folder / "run")
+    flags = ["--preset", "leap-cube", "--hand", str(hand.path), "--smoke", "--out", out]
+    assert train(["teacher", *flags]) == 0
+    return out
+
+
+@pytest.fixture(params=["dclaw3", "unlike"])
+def teacher(request) -> str:
+    """Whom a student imitates, of fingers that are alike and of others."""
+    return "dclaw3" if request.param == "dclaw3" else request.getfixturevalue("unlike")
+
+
 @pytest.mark.parametrize("stage", [0, 1, 2])
-def test_every_stage_learns_what_it_is_shown(stage, tmp_path):
+def test_every_stage_learns_what_it_is_shown(stage, teacher, tmp_path):
     """The same few looks and sequences again and again: their losses fall."""
-    trainer = trainer_of(settings(stage, tmp_path))
+    trainer = trainer_of(replace(settings(stage, tmp_path), teacher=teacher))
     assert trainer.source.collect(trainer.acting, lambda: False)
     looks = next(trainer.source.looks(trainer.acting))
     sequences = next(trainer.source.sequences(), None)
@@ -276,6 +299,45 @@ def test_a_run_leaves_a_policy_that_is_the_network(policy):
     write_policy(student, policy.with_name("other.safetensors"))
     other = read_policy(policy.with_name("other.safetensors"))
     torch.testing.assert_close(other.network.action.bias, student.network.action.bias)
+
+
+def test_a_student_of_unlike_fingers_sees_what_lies_in_the_palm_and_moves_all_motors(
+    unlike, tmp_path
+):
+    trainer = trainer_of(replace(settings(2, tmp_path), teacher=unlike))
+    teacher_sees = trainer.source.env.env.cfg.randomisation
+    assert teacher_sees.enabled and not teacher_sees.tracked_pose.enabled
+    trainer.learn(1)
+    trainer.close()
+    student = read_policy(tmp_path / "policy.safetensors")
+    assert student.num_actions == 5
+    env = environment(student)
+    actor, _ = actor_of(str(tmp_path), student, env, goals="points", sensor_errors=True)
+    advance(env, actor.act(torch.empty(0)))
+    points = actor.camera.points.numpy()
+    scene, hand = env.scene, env.hand
+    assert np.isfinite(actor.act(torch.empty(0)).numpy()).all()
+    poses = env.sim.body_q.numpy()[:, scene.object_body]
+    in_base = compose(invert(hand.mount), poses)[:, :3]
+    near = np.linalg.norm(points - in_base[:, None], axis=2) < 0.5 * env.objects[0].longest_side
+    assert (near.sum(axis=1) > LEAST_SEEN).all()
+    env.close()
+
+
+def test_objects_of_a_teacher_that_are_not_here_are_to_be_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(ReorientCfg, "of", lambda *_: ReorientCfg(objects=("fit",)))
+    with pytest.raises(ValueError, match=r"teacher's own objects .*--objects[\s\S]*'fit'"):
+        trainer_of(replace(settings(1, tmp_path), task=StageTaskCfg()))
+
+
+def test_shapes_that_are_made_have_the_sizes_that_the_hand_holds(unlike, tmp_path):
+    trainer = trainer_of(replace(settings(0, tmp_path), teacher=unlike))
+    assert trainer.source.collect(trainer.acting, lambda: False)
+    clouds = torch.cat([looks.sight.goal for looks in trainer.source.looks(trainer.acting)])
+    side = (clouds.amax(dim=1) - clouds.amin(dim=1)).amax(dim=1)
+    # A tenth beyond 4 to 5 cm, and the noise of scans.
+    assert side.min() > 0.03 and side.max() < 0.08
+    trainer.close()
 
 
 def environment(policy) -> ReorientEnv:

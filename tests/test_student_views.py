@@ -43,7 +43,7 @@ def hands(hand):
 @pytest.fixture
 def shapes():
     torch.manual_seed(1)
-    return made_shapes(16, 5 * COUNT, CPU)
+    return made_shapes(16, 5 * COUNT, (0.085, 0.165), CPU)
 
 
 def plates(hands, gap_m):

@@ -99,7 +99,10 @@ def settings_of(name: str) -> "TeacherCfg":
     try:
         base = gpu()
         task = ReorientCfg.of_task(state["task"])
-        env = replace(task, curriculum=base.env.curriculum)
+        curriculum = base.env.curriculum
+        if task.table.lift_share == 0.0:  # nothing is off a table
+            curriculum = replace(curriculum, object_weight=1.0)
+        env = replace(task, curriculum=curriculum)
         learner = state["learner"]
         settings = dict(learner["ppo"])
         settings.pop("imitation_iterations", None)  # how the installed policies began

@@ -142,10 +142,21 @@ def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
 def task_of_teacher(
     teacher: "TrainedPolicy", chosen: StageTaskCfg, condition: RandomisationCfg | None = None
 ) -> ReorientCfg:
-    """The environments of a teacher's training, randomised so or as ``condition`` says."""
+    """The environments of a teacher's training, randomised so or as ``condition`` says.
+
+    Raises:
+        ValueError: No objects are named, and those of its training are not here.
+    """
+    from vd.assets_usd.objects.sets import check_sets
     from vd.policy.agents import task_for
 
     trained = ReorientCfg.of(teacher)
+    if not chosen.objects:
+        try:
+            check_sets(trained.objects)
+        except ValueError as error:
+            message = f"the teacher's own objects are not here; name --objects\n{error}"
+            raise ValueError(message) from error
     return task_for(
         teacher,
         objects=chosen.objects or trained.objects,

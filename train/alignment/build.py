@@ -58,10 +58,10 @@ def _trainer(
     hands = Hands(hand, cfg.align.hands, camera=cfg.camera, device=device)
     points = CLOUDS * cfg.align.points
     place = hands.eye.device
-    held_out = {"made": made_shapes(UNSEEN_SHAPES, points, place)}
+    held_out = {"made": made_shapes(UNSEEN_SHAPES, points, hands.sides, place)}
     if cfg.task.validation:
         held_out["validation"] = centred_points(load_set(cfg.task.validation), points, place)
-    bank = ShapeBank(load_set(task.objects), cfg.align.shapes, points, place)
+    bank = ShapeBank(load_set(task.objects), cfg.align.shapes, points, hands.sides, place)
     spec = AlignmentSpec(
         network=network.cfg, points=cfg.align.points, hand=task.hand, camera=cfg.camera
     )

@@ -193,7 +193,7 @@ def smoke(stage: Stage) -> AlignmentTrainCfg:
         network=network,
     )
     looks = replace(cfg.looks, steps=2)
-    task = replace(cfg.task, num_envs=4)
+    task = replace(cfg.task, objects=("cube",), num_envs=4)
     return replace(cfg, smoke=True, run=run, align=align, looks=looks, task=task)
 
 

@@ -42,13 +42,20 @@ class ShapeBank:
         objects: The meshes.
         count: K.
         points: P, points of each.
+        sides: Shortest and longest longest side of a shape [m].
         device: Torch device.
     """
 
     def __init__(
-        self, objects: Sequence[ObjectModel], count: int, points: int, device: torch.device
+        self,
+        objects: Sequence[ObjectModel],
+        count: int,
+        points: int,
+        sides: tuple[float, float],
+        device: torch.device,
     ) -> None:
         self._meshes = centred_points(objects, max(MESH_POINTS, points), device)
+        self._sides = sides
         self._oldest = 0
         self.shapes = torch.empty((count, points, 6), dtype=torch.half, device=device)
         """Points [m] and normals [count, P, 6]."""
@@ -60,8 +67,9 @@ class ShapeBank:
         while count > 0:
             some = min(SHAPES_AT_ONCE, count)
             half = (some + 1) // 2
-            made = made_shapes(half, points, self._meshes.device)
-            shapes = torch.cat([made, mesh_shapes(self._meshes, some - half, points)])
+            made = made_shapes(half, points, self._sides, self._meshes.device)
+            deformed = mesh_shapes(self._meshes, some - half, points, self._sides)
+            shapes = torch.cat([made, deformed])
             rows = (self._oldest + torch.arange(some, device=shapes.device)) % size
             self.shapes[rows] = shapes.half()
             self._oldest = (self._oldest + some) % size

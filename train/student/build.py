@@ -10,7 +10,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.command.config import to_dict
 from vd.command.versions import installed_versions
-from vd.envs.cfg import ObservationCfg, ReorientCfg
+from vd.envs.cfg import ObservationCfg, ReorientCfg, TrackedPoseCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.conditions import CONDITIONS
 from vd.policy.actor import PACKAGES, TrainedPolicy
@@ -44,6 +44,7 @@ def student_task(teacher: TrainedPolicy, cfg: StudentTrainCfg) -> ReorientCfg:
         observation_jitter_s=0.0,
         encoder_latency_s=(0.0, 0.0),
         object_pose_error=(0.0, 0.0),
+        tracked_pose=TrackedPoseCfg(),
     )
     if cfg.stage == RENDERED and draws.enabled:
         draws = replace(draws, effects={**CONDITIONS["mixed"].effects, **draws.effects})
@@ -139,6 +140,8 @@ def _made(
         device=device,
     )
     held_out = load_set(cfg.task.validation) if cfg.task.validation else []
+    if task.fit_objects:
+        held_out = [item.fitted(hand.workspace.size_m) for item in held_out]
     source = MadeSequences(load_set(task.objects), held_out, hands, cfg)
     goals = torch.zeros((cfg.learn.batch, cfg.clouds.points, 3), device=device)
     return source, ActingStudent(network, hand, goals)

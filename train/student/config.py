@@ -205,7 +205,7 @@ def smoke(stage: Stage) -> StudentTrainCfg:
         student=replace(cfg.student, channels=(8, 16), voxel_m=0.01),
         learn=replace(cfg.learn, window=2, batch=4, sequences=4),
         clouds=replace(cfg.clouds, shapes=4, hands=4, updates=2),
-        task=replace(cfg.task, num_envs=4),
+        task=replace(cfg.task, objects=("cube",), num_envs=4),
     )
 
 

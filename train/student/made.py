@@ -93,7 +93,7 @@ class MadeSequences:
         self.samples = cfg.clouds.updates * cfg.learn.batch
         points = CLOUDS * cfg.clouds.points
         device = hands.eye.device
-        self._bank = ShapeBank(objects, cfg.clouds.shapes, points, device)
+        self._bank = ShapeBank(objects, cfg.clouds.shapes, points, hands.sides, device)
         self._held_out = None
         if held_out:
             self._held_out = centred_points(held_out, points, device)

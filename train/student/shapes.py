@@ -25,8 +25,6 @@ CANDIDATES = 3072
 """Points of each body, of which those on the union's surface are drawn: more than a shape has in
 all.
 """
-LENGTH_M = (0.085, 0.165)
-"""Longest side of a shape along its axes [m]: what the hand turns."""
 HALF_AXES = (0.06, 0.56)
 """Half axes of a superquadric, drawn evenly in the logarithm: rods, plates and lumps."""
 FIRST_GROWN = 1.5
@@ -323,31 +321,34 @@ def deformed(shapes: Tensor, deformation: Deformation) -> Tensor:
     return torch.cat([at, normals], dim=-1)
 
 
-def sized(shapes: Tensor) -> Tensor:
-    """Shapes about the mean of their points [m] and of a random size.
+def sized(shapes: Tensor, sides: tuple[float, float]) -> Tensor:
+    """Shapes about the mean of their points [m] with longest sides in a range [m], drawn evenly.
 
     Points and normals [K, P, 6].
     """
     points = shapes[..., :3] - shapes[..., :3].mean(dim=1, keepdim=True)
     longest = (points.amax(dim=1) - points.amin(dim=1)).amax(dim=-1)
-    wanted = uniform(*LENGTH_M, len(points), device=points.device)
+    wanted = uniform(*sides, len(points), device=points.device)
     points = points * (wanted / longest)[:, None, None]
     return torch.cat([points, shapes[..., 3:]], dim=-1)
 
 
-def made_shapes(count: int, points: int, device: torch.device) -> Tensor:
-    """Unions of bodies, deformed: points [m] and normals [count, points, 6]."""
+def made_shapes(
+    count: int, points: int, sides: tuple[float, float], device: torch.device
+) -> Tensor:
+    """Unions of bodies, deformed, of :func:`sized`: points [m] and normals [count, points, 6]."""
     bodies = unions(count, points, device)
-    return sized(deformed(bodies, Deformation.draw(count, 1.0, device)))
+    return sized(deformed(bodies, Deformation.draw(count, 1.0, device)), sides)
 
 
-def mesh_shapes(meshes: Tensor, count: int, points: int) -> Tensor:
+def mesh_shapes(meshes: Tensor, count: int, points: int, sides: tuple[float, float]) -> Tensor:
     """Objects drawn from meshes, deformed.
 
     Args:
         meshes: Points [m] and normals of the objects' surfaces [O, P', 6].
         count: K.
         points: P, at most P'.
+        sides: Shortest and longest longest side of a shape [m].
 
     Returns:
         Points [m] and normals [count, points, 6].
@@ -357,4 +358,4 @@ def mesh_shapes(meshes: Tensor, count: int, points: int) -> Tensor:
     columns = torch.randperm(meshes.shape[1], device=device)[:points]
     some = meshes[rows, columns].float()
     some[..., :3] /= MESH_UNIT_M
-    return sized(deformed(some, Deformation.draw(count, MESH_STRENGTH, device)))
+    return sized(deformed(some, Deformation.draw(count, MESH_STRENGTH, device)), sides)

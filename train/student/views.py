@@ -35,6 +35,8 @@ SLACK_M = 0.012
 TOUCH_M = 0.008
 """Side of voxels; points in one with a point of the hand are taken for the hand's. What tells a
 camera's points apart drops voxels of 5 mm that touch the hand's, which reaches about as far."""
+SPARE = 0.1
+"""Shapes are up to this share smaller and larger than the hand's objects, whose sizes are drawn too."""
 REACH_M = 0.14
 """How far voxels go beyond where objects are: longer than half an object."""
 FACING = -0.05
@@ -111,6 +113,9 @@ class Hands:
         box = np.sort(compose(invert(hand.mount), poses)[:, :3], axis=0)
         self.box = tensor(box)
         """Corners of where objects are [2, 3]."""
+        low, high = hand.workspace.size_m
+        self.sides = (1.0 - SPARE) * low, (1.0 + SPARE) * high
+        """Shortest and longest longest side of shapes [m]."""
         self.count = count
         self.eye = tensor(eyes[:, :3])
         """Where the camera of each posture is [M, 3]."""
