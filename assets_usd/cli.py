@@ -64,8 +64,12 @@ class HandImport:
         from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
         from vd.evaluate.bowl import share_kept
 
-        judge = share_kept if self.bowl else None
-        done = import_hand(self.file, self.out, self.describe, judge)
+        def told(start: Path) -> float:
+            share = share_kept(start)
+            print(f"start pose: {share:.0%} of dropped cubes stay", flush=True)
+            return share
+
+        done = import_hand(self.file, self.out, self.describe, told if self.bowl else None)
         print("\n".join([*done.notes, *(f"warning: {text}" for text in done.warnings)]))
         print(joint_table(done.hand, done.sources))
         hand_sheet(done.hand, done.sources, done.hand.path.with_suffix(".png"))

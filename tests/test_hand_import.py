@@ -651,6 +651,14 @@ def test_a_palm_up_hand_starts_as_the_bowl_that_keeps_most(tmp_path):
     assert not any("bowl" in note for note in described.notes)
 
 
+def test_start_poses_are_told_as_they_are_judged(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "assets"))
+    monkeypatch.setattr("vd.evaluate.bowl.share_kept", lambda hand: 0.25)
+    monkeypatch.setattr("sys.argv", ["vd-assets", "hand", "import", str(write_urdf(tmp_path))])
+    assert cli.main() == 0
+    assert capsys.readouterr().out.count("start pose: 25% of dropped cubes stay") > 1
+
+
 @pytest.mark.parametrize("name", REAL)
 def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_dir, name):
     path = shared_dir / "hands" / f"{name}_hand" / f"{name}_hand_right.urdf"
