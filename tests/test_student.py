@@ -435,6 +435,9 @@ def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
     torch.testing.assert_close(acting.belief.rotation[0], truth @ misled.other)
     misled.doubts = 0.3, 0.35
     senses = dataclasses.replace(senses, fresh=torch.zeros(1, dtype=torch.bool))
+    blank = dataclasses.replace(senses, points=torch.full_like(seen, torch.nan))
+    for _ in range(WATCHED):
+        acting.look(blank)  # tells nothing, and takes no step of those that do
     acting.look(senses)  # 0.8 for 0.75: not yet
     torch.testing.assert_close(acting.belief.rotation[0], truth @ misled.other)
     for _ in range(2):

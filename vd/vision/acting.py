@@ -105,7 +105,7 @@ class ActingStudent:
         if begin is None:
             seen = torch.isfinite(senses.points).all(dim=-1).sum(dim=1) >= LEAST_SEEN
             found = (self.lost & seen).nonzero()[:, 0]
-            watched = self._rivals.left.nonzero()[:, 0]
+            watched = (self._rivals.left.bool() & seen).nonzero()[:, 0]
             if len(watched):
                 self._compare(senses, watched)
             if len(found):

@@ -16,7 +16,8 @@ RIVALS = 4
 """Beliefs that are followed of each hand (ours). Chosen on 57 episodes of YCB objects: with one 28 % of
 goals were reached by true distance, with four 46, with eight 42, each for ten steps."""
 WATCHED = 30
-"""Control steps for which they are (ours). On the same: ten 46 %, thirty 54, the whole episode 53."""
+"""Control steps for which they are (ours); those count in which something is seen. On the same: ten
+46 %, thirty 54, the whole episode 53."""
 APART_RAD = 0.5
 """Beliefs that are less far from each other than this are one (ours). Not tuned."""
 
