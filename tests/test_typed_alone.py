@@ -176,7 +176,15 @@ def test_a_hand_of_teachers_alone_names_them(typed, leap, tmp_path):
 
 @pytest.mark.parametrize(
     "command",
-    ["teacher", "student --stage 2", "alignment", "alignment --stage 1", "adapt", "tracker"],
+    [
+        "teacher",
+        "student --stage 2",
+        "alignment",
+        "alignment --stage 1",
+        "adapt",
+        "adapt dclaw3",
+        "tracker",
+    ],
 )
 def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
     command, typed, tmp_path, monkeypatch
@@ -195,7 +203,8 @@ def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
     if isinstance(cfg, tracker.TrackerCfg):
         assert (cfg.objects, cfg.episodes, cfg.stop_tolerance) == (("cube",), 2, math.pi)
     elif isinstance(cfg, adapt.AdaptCfg):
-        assert cfg.policy == "dclaw4" and cfg.num_envs == 16 and cfg.steps <= 2048
+        assert cfg.policy == (command.partition(" ")[2] or "dclaw4")
+        assert cfg.num_envs == 16 and cfg.steps <= 2048
     else:
         assert cfg.smoke and cfg.run.max_steps <= 2048 and cfg.run.device == "cpu"
 

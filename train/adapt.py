@@ -14,7 +14,6 @@ from vd.command.line import flags_of, parse, say_same_as
 from vd.envs.cfg import CurriculumCfg, LevelCfg, LooseCfg
 from vd.evaluate.conditions import EXACT
 from vd.policy.agents import (
-    DEFAULT_HAND,
     DEFAULT_POLICY,
     NO_LAYER,
     check_names,
@@ -152,11 +151,12 @@ def _shrunk(cfg: AdaptCfg, folder: Path) -> AdaptCfg:
     from vd.assets_usd.hands import load_hand
 
     layer = folder / "as-it-is.usda"
-    hand = load_hand(DEFAULT_HAND)
+    policy = cfg.policy or DEFAULT_POLICY
+    hand = load_hand(read_start(find_start(policy))["task"]["hand"])
     write_layer(layer, hand, baseline={}, effects={}, tool="vd-train", recording="none")
     return replace(
         cfg,
-        policy=DEFAULT_POLICY,
+        policy=policy,
         hand_layer=layer,
         out=folder / "run",
         objects=("cube",),
