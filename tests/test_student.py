@@ -420,7 +420,8 @@ class Misled(Told):
             near = turn_angle(rotation.mT @ likely) < 1.15
             rotation = torch.where(near[:, None, None], likely, rotation)
             doubt = torch.where(near, how, doubt)
-        return Look(doubt, Belief(rotation, sight.belief.position), doubt, doubt, None)
+        moved = sight.belief.position + 0.001
+        return Look(doubt, Belief(rotation, moved), doubt, doubt, None)
 
 
 def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
@@ -433,6 +434,7 @@ def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
     senses = dataclasses.replace(senses, points=seen)
     acting.look(senses)
     torch.testing.assert_close(acting.belief.rotation[0], truth @ misled.other)
+    found = acting.belief.position
     misled.doubts = 0.3, 0.35
     senses = dataclasses.replace(senses, fresh=torch.zeros(1, dtype=torch.bool))
     blank = dataclasses.replace(senses, points=torch.full_like(seen, torch.nan))
@@ -440,6 +442,7 @@ def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
         acting.look(blank)  # tells nothing, and takes no step of those that do
     acting.look(senses)  # 0.8 for 0.75: not yet
     torch.testing.assert_close(acting.belief.rotation[0], truth @ misled.other)
+    torch.testing.assert_close(acting.belief.position, found)  # what is seen makes it better once
     for _ in range(2):
         acting.look(senses)
     torch.testing.assert_close(acting.belief.rotation[0], truth)

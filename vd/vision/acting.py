@@ -138,8 +138,9 @@ class ActingStudent:
             every = some.repeat_interleave(RIVALS)
             now = each(senses, itemgetter(every))
             belief, doubt = self.improved(now, self._rivals.of(some), every)
-            self._rivals.add(some, belief, doubt)
-            self._believe_best(some)
+            self._rivals.judge(some, doubt)
+            self._believe_best(some)  # as it was: see() makes it better
+            self._rivals.move(some, belief)
 
     def _believe_best(self, rows: Tensor) -> None:
         """Believe the best rival of each of the hands ``rows`` [R]."""

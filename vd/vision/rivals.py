@@ -62,13 +62,16 @@ class Rivals:
             doubt = doubt.masked_fill(near, torch.inf)
         self.left[rows] = WATCHED
 
-    def add(self, rows: Tensor, belief: Belief, doubt: Tensor) -> None:
-        """What a step made of the beliefs of hands ``rows``, and how much it doubts them [R K]."""
+    def judge(self, rows: Tensor, doubt: Tensor) -> None:
+        """Take in how much a step doubts the beliefs of hands ``rows`` [R K]."""
+        self.doubt[rows] += doubt.view(len(rows), -1)
+        self.left[rows] -= 1
+
+    def move(self, rows: Tensor, belief: Belief) -> None:
+        """Take what a step made of the beliefs of hands ``rows`` [R K]."""
         better = of_hands(belief, rows)
         self.belief.rotation[rows] = better.rotation
         self.belief.position[rows] = better.position
-        self.doubt[rows] += doubt.view(len(rows), -1)
-        self.left[rows] -= 1
 
     def of(self, rows: Tensor) -> Belief:
         """The beliefs of hands ``rows`` one after the other [R K]."""
