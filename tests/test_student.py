@@ -446,6 +446,11 @@ def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
     for _ in range(2):
         acting.look(senses)
     torch.testing.assert_close(acting.belief.rotation[0], truth)
+    misled.doubts = 0.3, 4.0  # and what is given up never comes back
+    acting.look(senses)
+    misled.doubts = 4.0, 0.0
+    acting.look(senses)
+    torch.testing.assert_close(acting.belief.rotation[0], truth)
 
 
 def test_it_stops_by_the_angle_from_its_belief_to_the_goal_and_not_before_it_saw_anything():

@@ -135,12 +135,12 @@ class ActingStudent:
     def _compare(self, senses: Senses, rows: Tensor) -> None:
         """Look by all rivals of the hands ``rows`` [R], and believe the least doubted until now."""
         for some in rows.split(AT_ONCE // RIVALS):
-            every = some.repeat_interleave(RIVALS)
-            now = each(senses, itemgetter(every))
-            belief, doubt = self.improved(now, self._rivals.of(some), every)
-            self._rivals.judge(some, doubt)
+            hands, rivals = self._rivals.likely(some)
+            now = each(senses, itemgetter(hands))
+            belief, doubt = self.improved(now, self._rivals.of(hands, rivals), hands)
+            self._rivals.judge(hands, rivals, doubt)
             self._believe_best(some)  # as it was: see() makes it better
-            self._rivals.move(some, belief)
+            self._rivals.move(hands, rivals, belief)
 
     def _believe_best(self, rows: Tensor) -> None:
         """Believe the best rival of each of the hands ``rows`` [R]."""
