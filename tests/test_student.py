@@ -379,12 +379,19 @@ class Told(torch.nn.Module):
         return Look(doubt, Belief(better, sight.belief.position), doubt, doubt, None)
 
 
-def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
+def acting_by(kind: type[Told], hands: int) -> tuple[ActingStudent, Senses]:
+    """Who acts by a network of a kind that knows a random truth, and what hands sense [N]."""
     hand = load_hand("dclaw3")
-    senses = senses_of(hand, 2, torch.device("cpu"))
-    truth = quaternion_matrices(random_rotations(1, torch.device("cpu")))[0]
-    told = Told(truth, HandFrames(hand, truth.device))
-    acting = ActingStudent(told, hand, torch.randn(2, 50, 3))
+    device = torch.device("cpu")
+    truth = quaternion_matrices(random_rotations(1, device))[0]
+    network = kind(truth, HandFrames(hand, device))
+    acting = ActingStudent(network, hand, torch.randn(hands, 50, 3))
+    return acting, senses_of(hand, hands, device)
+
+
+def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
+    acting, senses = acting_by(Told, 2)
+    truth = acting.network.truth
     middle = torch.tensor([0.01, -0.02, 0.16])
     seen = middle + 0.02 * torch.randn(2, 40, 3)
     seen[1] = torch.nan
@@ -425,11 +432,9 @@ class Misled(Told):
 
 
 def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
-    hand = load_hand("dclaw3")
-    senses = senses_of(hand, 1, torch.device("cpu"))
-    truth = quaternion_matrices(random_rotations(1, torch.device("cpu")))[0]
-    misled = Misled(truth, HandFrames(hand, truth.device))
-    acting = ActingStudent(misled, hand, torch.randn(1, 50, 3))
+    acting, senses = acting_by(Misled, 1)
+    misled = acting.network
+    truth = misled.truth
     seen = torch.tensor([0.01, -0.02, 0.16]) + 0.02 * torch.randn(1, 40, 3)
     senses = dataclasses.replace(senses, points=seen)
     acting.look(senses)

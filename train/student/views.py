@@ -36,7 +36,8 @@ TOUCH_M = 0.008
 """Side of voxels; points in one with a point of the hand are taken for the hand's. What tells a
 camera's points apart drops voxels of 5 mm that touch the hand's, which reaches about as far."""
 SPARE = 0.1
-"""Shapes are up to this share smaller and larger than the hand's objects, whose sizes are drawn too."""
+"""Shapes are up to this share smaller and larger than the hand's objects, whose sizes are drawn too
+(ours). Not tuned."""
 REACH_M = 0.14
 """How far voxels go beyond where objects are: longer than half an object."""
 FACING = -0.05
