@@ -47,9 +47,10 @@ def hand_usd(name: str) -> Path:
     from vd.assets_usd.hand_import.description import BUILT_IN
 
     how = f" URDF --describe {name}" if name in BUILT_IN else ""
+    there = {*HANDS, *(file.parent.name for file in imported_folder("").glob("*/*.usda"))}
     raise ValueError(
-        f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, give a hand's USD file, or "
-        f"import one (vd-assets hand import{how})"
+        f"no hand is called {name!r}: choose one of {', '.join(sorted(there))}, give a hand's USD "
+        f"file, or import one (vd-assets hand import{how})"
     )
 
 

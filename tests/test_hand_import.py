@@ -612,7 +612,7 @@ def test_command_imports_into_the_cache_and_draws_a_sheet(tmp_path, monkeypatch,
     assert (np.ptp(image, axis=2) > 40).mean() > 0.01, "links are coloured"
     monkeypatch.setattr(sys, "argv", ["vd-assets", "hand", "import", str(tmp_path / "knob.stl")])
     assert cli.main() == 1 and "URDF nor an MJCF" in capsys.readouterr().err
-    with pytest.raises(ValueError, match=r"'claw'.*import one"):
+    with pytest.raises(ValueError, match=r"'claw': choose .*\btoy\b.*import one"):
         load_hand("claw")
 
 
