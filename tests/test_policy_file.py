@@ -116,6 +116,10 @@ def test_every_flipped_byte_is_noticed(path):
         (lambda v: v.update(format="other 9"), r"format is 'other 9', this version reads"),
         (lambda v: v.update(future=1), r"contract has no field future"),
         (lambda v: v["task"].update(gone=1), r"contract\.task has no field gone"),
+        (
+            lambda v: v["task"]["start"].update(reached_share=0.3),
+            r"contract\.task\.start has no field reached_share",
+        ),
         (lambda v: v["network"].update(hidden=3), r"contract\.network\.hidden: expected a list"),
     ],
 )
@@ -123,6 +127,12 @@ def test_what_this_version_does_not_know_is_refused_by_file_and_field(path, chan
     edit(path, change)
     with pytest.raises(ContractError, match=f"{path}: {message}.*take the version"):
         read_policy(path)
+
+
+def test_a_setting_that_is_gone_is_read_where_it_was_off(path):
+    before = ReorientCfg.of(read_policy(path))
+    edit(path, lambda v: v["task"]["start"].update(reached_share=0.0))
+    assert ReorientCfg.of(read_policy(path)) == before
 
 
 def test_weights_that_are_others_are_refused(path):

@@ -204,9 +204,6 @@ class StartCfg:
     """Poses at rest of each environment, to choose from; found by dropping the object at the
     beginning.
     """
-    reached_share: float = 0.0
-    """Ours: share of the episodes that begin in a state which the policy reached itself in that
-    environment, with the object off the table and slow: grasped, or about to be."""
 
 
 @dataclass(frozen=True)
@@ -536,6 +533,10 @@ class ReorientCfg:
             ValueError: It is of another version; ``where`` says what it is.
         """
         kept = {name: value for name, value in task.items() if name != "curriculum"}
+        start = dict(kept.get("start", {}))
+        if start.get("reached_share") == 0.0:  # gone; where it was not off it is refused
+            del start["reached_share"]
+        kept["start"] = start
         return from_dict(cls, kept, where=where)
 
     @property
@@ -555,7 +556,6 @@ class ReorientCfg:
             raise ValueError(
                 "observation.history knows no goal to turn the view to; leave observation.view world"
             )
-        require(self.start, "start.", "in [0, 1]", "reached_share")
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
         if isinstance(self.objects, str):

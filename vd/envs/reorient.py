@@ -17,7 +17,6 @@ from vd.envs.curriculum import Levels, moving_levels, next_levels
 from vd.envs.followers import ActuatedActions
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
-from vd.envs.reached_starts import ReachedStarts
 from vd.envs.saved_state import load_arrays, save_state, saved_levels
 from vd.envs.spin import Spin
 from vd.envs.starts import FreeStarts
@@ -191,9 +190,6 @@ class ReorientEnv:
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         self._reset_q = wp.array(self.hand.start, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, self.hand.start)
-        self._reached: ReachedStarts | None = None
-        if self.cfg.start.reached_share > 0.0:
-            self._reached = ReachedStarts(self.state, self.motion())
         self._actuated = ActuatedActions(self.state)
         self.refused = zeros(n, dtype=wp.int32)
         """Actions that were not finite since that was told, shape [N]."""
@@ -254,9 +250,7 @@ class ReorientEnv:
         self.ended.fill_(1)
         self._new_goal.zero_()
         self.randomiser.draw(self.ended)
-        self._reset_envs(
-            self.ended, use_start=object_quat is not None, use_goal=goal_quat is not None
-        )
+        self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.write_model()
         self.observe()
 
@@ -276,7 +270,7 @@ class ReorientEnv:
         self.ended.zero_()
         self._new_goal.assign(mask)
         self._given_goal.assign(goals)
-        self._reset_envs(self.ended, use_goal=True)
+        self._reset_envs(use_goal=True)
         self.observe()
 
     def step(self, action: Any) -> None:
@@ -405,12 +399,7 @@ class ReorientEnv:
     def _launch_renewal(self) -> None:
         """Give new goals, reset what has ended, and observe."""
         self.randomiser.redraw(self.ended)
-        if self._reached is None:
-            self._reset_envs(self.ended)
-        else:
-            self._reached.keep(self.ended, self.step_count)
-            self._reached.begin(self.ended, self._new_goal, self.step_count)
-            self._reset_envs(self._reached.reset)
+        self._reset_envs()
         self.observer.observe()
 
     def _judge(self) -> None:
@@ -472,10 +461,8 @@ class ReorientEnv:
             [self.timed_out, self.done, self.ended, self._new_goal],
         )
 
-    def _reset_envs(
-        self, reset: wp.array, *, use_start: bool = False, use_goal: bool = False
-    ) -> None:
-        """Reset the environments of ``reset`` [N], give a goal to those of ``_new_goal`` too."""
+    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
+        """Reset the environments of ``ended``, give a goal to those of ``_new_goal`` too."""
         sim = self.sim
         p = self.parameters
         self._launch(
@@ -485,7 +472,7 @@ class ReorientEnv:
                 p.start,
                 p.goal,
                 self._rest_poses,
-                reset,
+                self.ended,
                 self._new_goal,
                 self._given_start,
                 int(use_start),
@@ -504,14 +491,14 @@ class ReorientEnv:
                 self._env_mask,
             ],
         )
-        self._free_starts.move(reset)
+        self._free_starts.move(self.ended)
         if self.symmetry_frames is not None:
-            self.symmetry_frames.choose(reset, self._new_goal)
+            self.symmetry_frames.choose(self.ended, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(reset)
+            sim.servo.reset(self.ended)
         self.observer.begin(self.ended)
         if self.spin is not None:
             self.spin.begin(self.ended)

@@ -273,10 +273,8 @@ def task_for(
     observation = replace(observation, dynamics="none", critic_terms={})
     task = replace(task, observation=observation, reward=replace(task.reward, terms={}))
     task = _on_hand(task, hand, hand_layer)
-    start = replace(task.start, reached_share=0.0)
     if at_rest is not None:
-        start = replace(start, at_rest=at_rest)
-    task = replace(task, start=start)
+        task = replace(task, start=replace(task.start, at_rest=at_rest))
     if max_goal_angle_rad is not None:
         task = replace(task, goal=replace(task.goal, max_angle_rad=max_goal_angle_rad))
     return replace(
