@@ -111,20 +111,6 @@ def test_a_latency_between_steps_is_that_of_the_nearest_physics_step():
     np.testing.assert_array_equal(run(env, 3)["seen"][-1][:, parts], past[-1 - 4])
 
 
-def test_jitter_makes_the_object_older_in_each_step_by_another_time():
-    present = run(make(), 3)["seen"]
-    random = late(1e-9, observation_jitter_s=1.9 * STEP_S)
-    seen = run(make(randomisation=random), 3)["seen"]
-    parts = teacher_observation_slices(3, 9)
-    place, joints = parts["object_position"], parts["joint_position"]
-    np.testing.assert_array_equal(seen[..., joints], present[..., joints])
-    height = present[:, :, place.start + 2]
-    assert (np.diff(height[:3], axis=0) < -0.01).all(), "the object falls from its start"
-    found = seen[1:3, :, place.start + 2]
-    assert (found >= height[1:3] - 1e-6).all() and (found <= height[0] + 1e-6).all()
-    assert len(np.unique(found - height[1:3])) > WORLDS, "another age in each environment and step"
-
-
 def tracked(**changes) -> RandomisationCfg:
     """A tracker of 6 poses a second, 50 ms late, without errors."""
     exact = {"dropped": 0.0, "jumping": 0.0, "noise": (0.0, 0.0)} | changes

@@ -129,9 +129,12 @@ def test_what_this_version_does_not_know_is_refused_by_file_and_field(path, chan
         read_policy(path)
 
 
-def test_a_setting_that_is_gone_is_read_where_it_was_off(path):
+@pytest.mark.parametrize(
+    ("group", "name"), [("start", "reached_share"), ("randomisation", "observation_jitter_s")]
+)
+def test_a_setting_that_is_gone_is_read_where_it_was_off(path, group, name):
     before = ReorientCfg.of(read_policy(path))
-    edit(path, lambda v: v["task"]["start"].update(reached_share=0.0))
+    edit(path, lambda v: v["task"][group].update({name: 0.0}))
     assert ReorientCfg.of(read_policy(path)) == before
 
 

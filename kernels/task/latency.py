@@ -132,25 +132,17 @@ def recall_state_kernel(
     slots: int,  # rows of each world, L
     tip_body: wp.array[int],  # [G] link of each fingertip; only their poses are written
     physics_dt: float,  # time between two rows [s]
-    jitter: wp.array[float],  # [1] most that the object is seen later still, drawn in each call [s]
     # In:
     latency_in: wp.array[float],  # [N] how late each object is seen [s], at most (L - 1) steps
     encoder_latency_in: wp.array[float],  # [N] how late joints and tips are seen [s], likewise
     head_in: wp.array[int],  # [N] slot written last
     ring_in: wp.array2d[float],  # [N L, C] past states
-    # In/Out:
-    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
     seen_out: StateArrays,  # arrays to write
 ):
     """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N]."""
     world = wp.tid()
-    latency = latency_in[world]
-    if jitter[0] > 0.0:
-        state, more = uniform(rng[world], wp.vec2(0.0, jitter[0]))
-        latency += more
-        rng[world] = next_stream(state, world)
-    seen = aged_row(world, latency, physics_dt, slots, head_in)
+    seen = aged_row(world, latency_in[world], physics_dt, slots, head_in)
     row = aged_row(world, encoder_latency_in[world], physics_dt, slots, head_in)
     for i in range(joints):
         seen_out.measured_q[world, i] = ring_in[row, i]

@@ -41,7 +41,6 @@ def student_task(teacher: TrainedPolicy, cfg: StudentTrainCfg) -> ReorientCfg:
         observation_noise_std=0.0,
         observation_offset_std=0.0,
         observation_latency_s=(0.0, 0.0),
-        observation_jitter_s=0.0,
         encoder_latency_s=(0.0, 0.0),
         object_pose_error=(0.0, 0.0),
         tracked_pose=TrackedPoseCfg(),

@@ -18,6 +18,9 @@ memory.
 """
 SLOWEST_POSES_HZ = 2.0
 """Fewest poses a second of a tracker (ours): as much of the past is kept in memory."""
+GONE = {"start": {"reached_share": 0.0}, "randomisation": {"observation_jitter_s": 0.0}}
+"""Settings that are gone, by group, and what they were where they did nothing: policies have them so.
+Others are refused."""
 View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -417,9 +420,6 @@ class RandomisationCfg:
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the object's state is that the policy sees [s], drawn for each episode, to the
     nearest physics step: a camera and its loop. Rewards and success are of the true state."""
-    observation_jitter_s: float = 0.0
-    """By how much more the object's state is old in a step, uniform from 0 to this [s]: images come
-    at a rate of their own, and the newest is up to one period old (1/30 s of a D415)."""
     encoder_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step
     begins. Drawn at the same share of its range as the object's."""
@@ -448,18 +448,11 @@ class RandomisationCfg:
                     f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and "
                     f"{MAX_LATENCY_S:g}"
                 )
-        if not 0.0 <= self.observation_jitter_s <= MAX_LATENCY_S:
-            raise ValueError(
-                f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to "
-                f"be in [0, {MAX_LATENCY_S:g}]"
-            )
         require(self, "randomisation.", "zero or positive", "object_sizes")
         self.tracked_pose.validate()
-        late = self.observation_latency_s[1] + self.observation_jitter_s
-        if self.tracked_pose.enabled and late > 0.0:
+        if self.tracked_pose.enabled and self.observation_latency_s[1] > 0.0:
             raise ValueError(
-                "randomisation.tracked_pose has ages of its own: leave observation_latency_s and "
-                "observation_jitter_s at 0"
+                "randomisation.tracked_pose has ages of its own: leave observation_latency_s at 0"
             )
         require(self, "randomisation.", "positive", "force_s")
         from vd.envs.effects import check_effects  # needs Warp, which settings alone do not
@@ -533,10 +526,12 @@ class ReorientCfg:
             ValueError: It is of another version; ``where`` says what it is.
         """
         kept = {name: value for name, value in task.items() if name != "curriculum"}
-        start = dict(kept.get("start", {}))
-        if start.get("reached_share") == 0.0:  # gone; where it was not off it is refused
-            del start["reached_share"]
-        kept["start"] = start
+        for group, gone in GONE.items():
+            fields = dict(kept.get(group, {}))
+            for name, off in gone.items():
+                if fields.get(name) == off:
+                    del fields[name]
+            kept[group] = fields
         return from_dict(cls, kept, where=where)
 
     @property

@@ -43,7 +43,7 @@ class SeenState:
         n = state.num_envs
         random = state.cfg.randomisation
         longest = max(
-            random.observation_latency_s[1] + random.observation_jitter_s,
+            random.observation_latency_s[1],
             random.encoder_latency_s[1],
             _oldest_pose_s(state.cfg),
         )
@@ -72,7 +72,6 @@ class SeenState:
         self._model = [d, slots, state.fingers.tip_body]
         ranges = [random.observation_latency_s, random.encoder_latency_s]
         self._ranges = state.parameters.blended(np.zeros((2, 2)), ranges, wp.vec2)
-        self._jitter = state.parameters.blended([0.0], [random.observation_jitter_s], float)
         sim.after_physics_step = self.record
 
     def record(
@@ -99,10 +98,11 @@ class SeenState:
         """Refresh :attr:`arrays`."""
         if self.is_late:
             state = self._state
-            times = [state.cfg.sim.physics_dt, self._jitter]
-            inputs = [*times, self.latency, self.encoder_latency, self.head, self._ring]
+            ages = [state.cfg.sim.physics_dt, self.latency, self.encoder_latency]
             state.launch(
-                recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)]
+                recall_state_kernel,
+                [*self._model, *ages, self.head, self._ring],
+                [_packed(self.arrays)],
             )
 
     def _now(self, joint_q: wp.array, joint_qd: wp.array, *bodies: wp.array) -> StateArrays:
