@@ -340,6 +340,16 @@ def test_shapes_that_are_made_have_the_sizes_that_the_hand_holds(unlike, tmp_pat
     trainer.close()
 
 
+def test_the_eyes_of_another_hands_student_are_gone_on_from(policy, unlike, tmp_path):
+    trainer = trainer_of(replace(settings(0, tmp_path), teacher=unlike, init=policy))
+    eyes = read_policy(policy).network
+    assert trainer.network.num_actions != eyes.num_actions
+    for name in ("stages", "flow"):
+        weights = getattr(trainer.network, name).state_dict()
+        torch.testing.assert_close(weights, getattr(eyes, name).state_dict())
+    trainer.close()
+
+
 def environment(policy) -> ReorientEnv:
     task = replace(ReorientCfg.of(policy), num_envs=2, objects=("cuboid",))
     return ReorientEnv(task, "cpu")

@@ -101,13 +101,15 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
 
 
 def _network(cfg: StudentTrainCfg, teacher: TrainedPolicy, device: str) -> Student:
-    """The student, with the weights of the one that it begins from."""
+    """The student, with the weights of the one that it begins from; of another hand's, its eyes."""
     network = Student(cfg.student, teacher.num_actions, teacher.contract.num_tips).to(device)
     if cfg.init is not None:
         policy = open_student(str(cfg.init), device)
-        if policy.hand != teacher.hand:
-            raise ValueError(f"--init {cfg.init} moves {policy.hand}, {cfg.teacher} {teacher.hand}")
-        network.load_state_dict(policy.network.state_dict())
+        if policy.hand == teacher.hand:
+            network.load_state_dict(policy.network.state_dict())
+        else:
+            network.stages.load_state_dict(policy.network.stages.state_dict())
+            network.flow.load_state_dict(policy.network.flow.state_dict())
     return network
 
 

@@ -119,8 +119,8 @@ class StudentTrainCfg:
     """Policy that labels, also the source of hand and task: a policy.safetensors, a run's folder, or
     the name of an installed one; dclaw4 by default."""
     init: Path | None = None
-    """Student to begin from: a policy.safetensors or a run's folder. By default that of the stage
-    before in runs/student, if it is there."""
+    """Student to begin from: a policy.safetensors or a run's folder; of another hand's, only its eyes
+    are taken. By default that of the stage before in runs/student, if it is there."""
     smoke: bool = False
     """Check the installation: the stage, tiny, on the CPU, for at most a minute. It learns nothing,
     and keeps nothing unless --out is given."""
