@@ -29,7 +29,7 @@ STALE_NOTE = f"{STALE}: the policy or the code that measures has changed since, 
 END = "<!-- figures: end -->"
 KEEP = ("protocol", "stopped_by", "rule", "overall", "held", "precise", "in_air", "consecutive")
 """What is stored of a row of a result."""
-DIGITS = {"with_policy": 0, "memory_gb": 1, "mean": 1}
+DIGITS = {"with_policy": 0, "memory_gb": 1, "mean": 1, "revolutions": 1}
 """Of measures that are no shares."""
 GROUP = re.compile(r"([\w-]+)=SET\b")
 """Objects that a command line leaves open."""
@@ -73,6 +73,8 @@ def _run_command(entry: dict[str, str], out: Path, flags: argparse.Namespace) ->
     given = dict(item.split("=", 1) for item in flags.objects)
     line = GROUP.sub(lambda group: given[group[1]], entry["command"])
     script, *words = shlex.split(line)
+    if script == "vd-eval":
+        return _run_spin(words, path, flags.device)
     module = {"vd-bench": "vd.bench.cli"}[script]
     words += ["--json", str(path)]
     if words[0] == "gap":  # a case is a file: what is there goes on, of this code alone
@@ -81,6 +83,19 @@ def _run_command(entry: dict[str, str], out: Path, flags: argparse.Namespace) ->
     words += [] if "--device" in words else ["--device", flags.device]
     out.mkdir(parents=True, exist_ok=True)
     return subprocess.run([sys.executable, "-m", module, *words]).returncode
+
+
+def _run_spin(words: list[str], path: Path, device: str) -> int:
+    """Measure turns without a goal by vd-eval, into ``path``; the exit status."""
+    policy = words[0]
+    out = path.with_suffix("")
+    words += ["--out", str(out), "--device", device]
+    status = subprocess.run([sys.executable, "-m", "vd.evaluate.cli", *words]).returncode
+    if status == 0:
+        measured = {"code": code_fingerprint(MEASURING), "policy": fingerprint(policy)}
+        measured |= json.loads((out / "spin.json").read_text())
+        path.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+    return status
 
 
 def _code_of_command(command: str) -> str:
