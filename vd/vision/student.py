@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 
 from vd.kernels.task.shapes import EXTENT_CENTRE_M, SHAPE_UNIT_M
 from vd.vision.cfg import StudentCfg
-from vd.vision.inputs import Belief, StudentInput, carried
+from vd.vision.inputs import Belief, StudentInput, carried, either
 from vd.vision.rotations import first_columns, matrices
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
 
@@ -220,11 +220,7 @@ class Student(nn.Module):
         turned = turn @ believed.rotation
         rotation = matrices(first_columns(turned))  # still a rotation after many steps
         position = believed.position + shift
-        blind = (seen == 0.0)[:, None]
-        better = Belief(
-            rotation=torch.where(blind[..., None], believed.rotation, rotation),
-            position=torch.where(blind, believed.position, position),
-        )
+        better = either(seen == 0.0, believed, Belief(rotation, position))
         of_look = torch.bincount(flow.look, minlength=looks)
         doubt = torch.segment_reduce(flow.log_scale, "mean", lengths=of_look, unsafe=True)
         return Look(self.told(sight, better).detach(), better, doubt, seen, flow)
