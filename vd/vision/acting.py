@@ -55,6 +55,8 @@ class Sighting:
     """These frames, int64 [R]."""
     belief: Belief
     """The better belief, base frame [R]."""
+    angle: Tensor
+    """From there to the goal [R] [rad]."""
     doubt: Tensor
     """How much it is doubted [R]."""
     voxels: Tensor
@@ -99,6 +101,7 @@ class ActingStudent:
 
     def forget(self, fresh: Tensor) -> None:
         """Remember nothing where an episode begins, bool [N]."""
+        self.lost = self.lost | fresh
         self.hidden = self.hidden.masked_fill(fresh[:, None], 0.0)
         self._rivals.left = self._rivals.left.masked_fill(fresh, 0)
 
@@ -109,18 +112,13 @@ class ActingStudent:
             senses: What was sensed.
             begin: What is believed where an episode begins [N].
         """
-        self._begin(senses, begin)
+        self.forget(senses.fresh)
+        self.belief = either(self.lost, begin, self.belief)
         self.lost = torch.zeros_like(self.lost)
         sight = self.build(senses, self.belief)
         look = self.network.look(sight)
         self.belief = self._kept(look, sight)
         return sight, look
-
-    def _begin(self, senses: Senses, first: Belief) -> None:
-        """Forget where episodes begin, and believe ``first`` [N] until the object is found."""
-        self.forget(senses.fresh)
-        self.lost = self.lost | senses.fresh
-        self.belief = either(self.lost, first, self.belief)
 
     @torch.no_grad()
     def follow(self, senses: Senses) -> Sighting:
@@ -128,19 +126,24 @@ class ActingStudent:
 
         Where their objects then are believed to be is kept.
         """
-        self._begin(senses, self.build.first_belief(senses.goal_quat))
+        self.forget(senses.fresh)
         seen = torch.isfinite(senses.points).all(dim=-1).sum(dim=1) >= LEAST_SEEN
-        found = (self.lost & seen).nonzero()[:, 0]
         watched = self._rivals.left.bool() & seen
-        if len(found):
-            self._search(senses, found)
-        self.lost = self.lost & ~seen
-        some = torch.arange(len(seen), device=seen.device).split(AT_ONCE // RIVALS)
-        sighting = joined([self._compare(senses, rows, watched[rows]) for rows in some])
+        if self.lost.any():
+            first = self.build.first_belief(senses.goal_quat)
+            self.belief = either(self.lost, first, self.belief)
+            found = self.lost & seen
+            if found.any():
+                self._search(senses, found.nonzero()[:, 0])
+            self.lost = self.lost & ~seen
+        if watched.any():
+            some = torch.arange(len(seen), device=seen.device).split(AT_ONCE // RIVALS)
+            sighting = joined([self._compare(senses, rows, watched[rows]) for rows in some])
+        else:
+            sighting = self.improved(senses, self.belief)
         self.belief = sighting.belief
         return sighting
 
-    @torch.no_grad()
     def _search(self, senses: Senses, rows: Tensor) -> None:
         """Believe what is doubted least of what all starts lead to, for the hands ``rows`` [R]."""
         starts = len(self._starts)
@@ -177,11 +180,18 @@ class ActingStudent:
         best = self._rivals.best(rows)
         return each(sighting, itemgetter(place.gather(1, best[:, None])[:, 0]))
 
-    def improved(self, senses: Senses, belief: Belief, rows: Tensor) -> Sighting:
-        """What the hands ``rows`` [R] see by beliefs."""
+    def improved(self, senses: Senses, belief: Belief, rows: Tensor | None = None) -> Sighting:
+        """What hands see by beliefs [R]; ``rows`` as of an :class:`InputBuilder`."""
         sight = self.build(senses, belief, rows)
         look = self.network.look(sight)
-        return Sighting(look.told, sight.frame, self._kept(look, sight), look.doubt, look.voxels)
+        return Sighting(
+            told=look.told,
+            frame=sight.frame,
+            belief=self._kept(look, sight),
+            angle=turn_angle(look.belief.rotation.mT @ sight.goal_rotation),
+            doubt=look.doubt,
+            voxels=look.voxels,
+        )
 
     def _kept(self, look: Look, sight: StudentInput) -> Belief:
         """What a look leaves to believe, base frame."""
@@ -198,18 +208,18 @@ class ActingStudent:
         self.hidden = decision.hidden
         return replace(decision, action=self.build.frames.joints_out(decision.action, frame))
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(self, senses: Senses) -> CameraDecision:
         """One control step."""
         sighting = self.follow(senses)
         decision = self.decide(sighting.told, sighting.frame)
         pose = self.pose
         turn = self._base[:, 3:]
-        goal = self.build.goal_rotation(senses.goal_quat)
-        angle = turn_angle(self.belief.rotation.mT @ goal)
         return CameraDecision(
             action=decision.action,
-            angle=angle.masked_fill(self.lost, torch.pi),  # or what was never seen would be stopped
+            angle=sighting.angle.masked_fill(
+                self.lost, torch.pi
+            ),  # or what was never seen would be stopped
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),
             voxels=sighting.voxels,
