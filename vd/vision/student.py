@@ -241,11 +241,12 @@ class Student(nn.Module):
     def _flow(self, voxels: SparseTensor, levels: list[SparseTensor], pooled: Tensor) -> Flow:
         """The shifts of the goal's voxels, from the cells of all stages that hold them."""
         sites = voxels.sites
-        goal = voxels.features[:, 8] > 0.0
+        goal = (voxels.features[:, 8] > 0.0).nonzero()[:, 0]
         keys = sites.keys[goal]
-        look = sites.coordinates[goal, 0].long()
+        cells = sites.coordinates[goal]
+        look = cells[:, 0].long()
         offset = voxels.features[goal, 9:12]
-        start = self.cfg.voxel_m * (sites.coordinates[goal, 1:] + 0.5 + offset)
+        start = self.cfg.voxel_m * (cells[:, 1:] + 0.5 + offset)
         columns = [start / PLACE_M, offset, pooled[look]]
         for level in levels:
             cell = keys & ~(level.sites.step**3 - 1)
