@@ -471,6 +471,29 @@ def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
     torch.testing.assert_close(acting.belief.rotation[0], truth)
 
 
+def test_hands_side_by_side_see_as_each_alone():
+    """One is followed by rivals, while the other is not seen, found or followed too."""
+    hand = load_hand("dclaw3")
+    network = student()
+    goals = 0.02 * torch.randn(2, 50, 3)
+    senses = senses_of(hand, 2, torch.device("cpu"))
+    both = ActingStudent(network, hand, goals)
+    alone = [ActingStudent(network, hand, goal[None]) for goal in goals]
+    for step, unseen in enumerate((1, 1, None, None, 0)):
+        points = torch.tensor([0.01, -0.02, 0.16]) + 0.02 * torch.randn(2, 40, 3)
+        if unseen is not None:
+            points[unseen] = torch.nan
+        fresh = torch.full((2,), step == 0)
+        now = dataclasses.replace(senses, points=points, fresh=fresh)
+        sighting = both.follow(now)
+        for i, one in enumerate(alone):
+            found = one.follow(each_row(now, [i]))
+            for name in ("told", "frame", "angle", "doubt", "voxels"):
+                together = getattr(sighting, name)[i]
+                torch.testing.assert_close(together, getattr(found, name)[0], atol=1e-4, rtol=1e-3)
+            torch.testing.assert_close(both.belief.position[i], one.belief.position[0])
+
+
 def test_it_stops_by_the_angle_from_its_belief_to_the_goal_and_not_before_it_saw_anything():
     hand = load_hand("dclaw3")
     senses = senses_of(hand, 2, torch.device("cpu"))

@@ -163,9 +163,9 @@ class ActingStudent:
             self.belief.position[some] = best.position
 
     def _compare(self, senses: Senses, rows: Tensor, watched: Tensor) -> Sighting:
-        """What the hands ``rows`` [R] see by what they believe.
+        """What the hands ``rows`` [R] see, each by the belief that is then doubted least.
 
-        Those ``watched`` [R] look by all rivals; of the one least doubted until now it is told.
+        Those ``watched`` [R] look by all rivals that may still be right.
         """
         likely = self._rivals.likely(rows, watched)
         row, rival = likely.nonzero().unbind(1)
