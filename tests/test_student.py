@@ -17,8 +17,8 @@ from vd.policy.senses import Senses
 from vd.train.student.sequences import Looks, flow_loss
 from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
-from vd.vision.inputs import Belief, HandFrames, InputBuilder, StudentInput, carried, each
-from vd.vision.rivals import WATCHED
+from vd.vision.inputs import Belief, HandFrames, InputBuilder, StudentInput, carried, each, either
+from vd.vision.rivals import RIVALS, WATCHED
 from vd.vision.rotations import (
     matrices_about,
     quaternion_matrices,
@@ -355,10 +355,17 @@ def test_it_learns_how_a_belief_is_wrong():
     assert look.flow.log_scale.mean() < 0.0
 
 
+HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+
+
 class Told(torch.nn.Module):
-    """A network that sets near beliefs right, and doubts those that stay wrong."""
+    """A network that sets near beliefs right where it sees, and doubts those that stay wrong.
+
+    ``beliefs`` counts those by which it looked.
+    """
 
     cfg = SMALL
+    beliefs = 0
 
     def __init__(self, truth: torch.Tensor, frames: HandFrames):
         super().__init__()
@@ -371,12 +378,18 @@ class Told(torch.nn.Module):
 
     def look(self, sight: StudentInput) -> Look:
         """The truth where the belief is near it."""
-        rotation = sight.belief.rotation
+        believed = sight.belief
+        self.beliefs += len(believed.rotation)
         truth = self.frames.turn[sight.frame] @ self.truth
-        near = turn_angle(rotation.mT @ truth) < 1.15
-        better = torch.where(near[:, None, None], truth, rotation)
-        doubt = turn_angle(better.mT @ truth)
-        return Look(doubt, Belief(better, sight.belief.position), doubt, doubt, None)
+        seen = sight.camera.isfinite().any(dim=2).any(dim=1)
+        better, doubt = self.better(believed, truth)
+        return Look(doubt, either(seen, better, believed), doubt, doubt, None)
+
+    def better(self, believed: Belief, truth: torch.Tensor) -> tuple[Belief, torch.Tensor]:
+        """What it believes where it sees, and how much it doubts that."""
+        near = turn_angle(believed.rotation.mT @ truth) < 1.15
+        rotation = torch.where(near[:, None, None], truth, believed.rotation)
+        return Belief(rotation, believed.position), turn_angle(rotation.mT @ truth)
 
 
 def acting_by(kind: type[Told], hands: int) -> tuple[ActingStudent, Senses]:
@@ -395,40 +408,38 @@ def test_an_object_is_looked_for_once_it_is_seen_and_then_followed():
     middle = torch.tensor([0.01, -0.02, 0.16])
     seen = middle + 0.02 * torch.randn(2, 40, 3)
     seen[1] = torch.nan
-    acting.look(dataclasses.replace(senses, points=seen))
+    acting.follow(dataclasses.replace(senses, points=seen))
     assert acting.lost.tolist() == [False, True]
     torch.testing.assert_close(acting.belief.rotation[0], truth)
     assert (acting.belief.position[0] - middle).norm() < 0.02
     first = acting.build.first_belief(senses.goal_quat)
     torch.testing.assert_close(acting.belief.rotation[1], first.rotation[1])
     later = dataclasses.replace(senses, fresh=torch.zeros(2, dtype=torch.bool))
-    acting.look(dataclasses.replace(later, points=seen.flip(0)))
+    acting.follow(dataclasses.replace(later, points=seen.flip(0)))
     assert not acting.lost.any()
     torch.testing.assert_close(acting.belief.rotation[1], truth)
     for _ in range(WATCHED):
-        acting.look(dataclasses.replace(later, points=seen.flip(0)))
-    acting.belief.rotation[0] = torch.eye(3)
-    acting.look(dataclasses.replace(later, points=seen.flip(0)))
-    torch.testing.assert_close(acting.belief.rotation[0], torch.eye(3))
+        acting.follow(dataclasses.replace(later, points=seen.flip(0)))
+    wrong = truth @ HALF_TURN
+    acting.belief.rotation[0] = wrong
+    acting.follow(dataclasses.replace(later, points=seen.flip(0)))
+    torch.testing.assert_close(acting.belief.rotation[0], wrong)
 
 
 class Misled(Told):
     """A network that takes the other way round for the truth, at the first look."""
 
-    other = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     doubts = 0.5, 0.4
 
-    def look(self, sight: StudentInput) -> Look:
-        """The truth or its opposite where the belief is near it."""
-        rotation = sight.belief.rotation
+    def better(self, believed: Belief, truth: torch.Tensor) -> tuple[Belief, torch.Tensor]:
+        """The truth or its opposite where the belief is near it, a millimetre aside."""
+        rotation = believed.rotation
         doubt = torch.full((len(rotation),), 2.0)
-        truth = self.frames.turn[sight.frame] @ self.truth
-        for likely, how in zip((truth, truth @ self.other), self.doubts, strict=True):
+        for likely, how in zip((truth, truth @ HALF_TURN), self.doubts, strict=True):
             near = turn_angle(rotation.mT @ likely) < 1.15
             rotation = torch.where(near[:, None, None], likely, rotation)
             doubt = torch.where(near, how, doubt)
-        moved = sight.belief.position + 0.001
-        return Look(doubt, Belief(rotation, moved), doubt, doubt, None)
+        return Belief(rotation, believed.position + 0.001), doubt
 
 
 def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
@@ -437,25 +448,50 @@ def test_of_two_likely_beliefs_that_is_followed_which_later_looks_doubt_less():
     truth = misled.truth
     seen = torch.tensor([0.01, -0.02, 0.16]) + 0.02 * torch.randn(1, 40, 3)
     senses = dataclasses.replace(senses, points=seen)
-    acting.look(senses)
-    torch.testing.assert_close(acting.belief.rotation[0], truth @ misled.other)
+    acting.follow(senses)
+    torch.testing.assert_close(acting.belief.rotation[0], truth @ HALF_TURN)
     found = acting.belief.position
     misled.doubts = 0.3, 0.35
     senses = dataclasses.replace(senses, fresh=torch.zeros(1, dtype=torch.bool))
     blank = dataclasses.replace(senses, points=torch.full_like(seen, torch.nan))
     for _ in range(WATCHED):
-        acting.look(blank)  # tells nothing, and takes no step of those that do
-    acting.look(senses)  # 0.8 for 0.75: not yet
-    torch.testing.assert_close(acting.belief.rotation[0], truth @ misled.other)
+        acting.follow(blank)  # tells nothing, and takes no step of those that do
+    misled.beliefs = 0
+    acting.follow(senses)  # 0.8 for 0.75: not yet
+    torch.testing.assert_close(acting.belief.rotation[0], truth @ HALF_TURN)
     torch.testing.assert_close(acting.belief.position, found)  # what is seen makes it better once
+    assert misled.beliefs == RIVALS, "by each it looks once"
     for _ in range(2):
-        acting.look(senses)
+        acting.follow(senses)
     torch.testing.assert_close(acting.belief.rotation[0], truth)
     misled.doubts = 0.3, 4.0  # and what is given up never comes back
-    acting.look(senses)
+    acting.follow(senses)
     misled.doubts = 4.0, 0.0
-    acting.look(senses)
+    acting.follow(senses)
     torch.testing.assert_close(acting.belief.rotation[0], truth)
+
+
+def test_hands_side_by_side_see_as_each_alone():
+    """One is followed by rivals, while the other is not seen, found or followed too."""
+    hand = load_hand("dclaw3")
+    network = student()
+    goals = 0.02 * torch.randn(2, 50, 3)
+    senses = senses_of(hand, 2, torch.device("cpu"))
+    both = ActingStudent(network, hand, goals)
+    alone = [ActingStudent(network, hand, goal[None]) for goal in goals]
+    for step, unseen in enumerate((1, 1, None, None, 0)):
+        points = torch.tensor([0.01, -0.02, 0.16]) + 0.02 * torch.randn(2, 40, 3)
+        if unseen is not None:
+            points[unseen] = torch.nan
+        fresh = torch.full((2,), step == 0)
+        now = dataclasses.replace(senses, points=points, fresh=fresh)
+        sighting = both.follow(now)
+        for i, one in enumerate(alone):
+            found = one.follow(each_row(now, [i]))
+            for name in ("told", "frame", "angle", "doubt", "voxels"):
+                together = getattr(sighting, name)[i]
+                torch.testing.assert_close(together, getattr(found, name)[0], atol=1e-4, rtol=1e-3)
+            torch.testing.assert_close(both.belief.position[i], one.belief.position[0])
 
 
 def test_it_stops_by_the_angle_from_its_belief_to_the_goal_and_not_before_it_saw_anything():

@@ -182,8 +182,7 @@ class SimulatedSequences:
             belief = self._errors.about(place, senses.fresh)
             sight = acting.build(senses, belief, clouds=False)
             return sight, acting.network.told(sight, sight.belief), sight.belief
-        sight = acting.look(senses, off(place))
-        look = acting.see(sight)
+        sight, look = acting.look(senses, off(place))
         return sight, look.told, look.belief
 
     def _learned(self) -> Tensor:

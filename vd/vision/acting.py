@@ -11,7 +11,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.geometry.quaternions import product, rotated
 from vd.policy.contract import Contract, Contracted, StudentSpec
 from vd.policy.senses import CameraDecision, Senses
-from vd.vision.inputs import Belief, InputBuilder, StudentInput, each
+from vd.vision.inputs import Belief, InputBuilder, StudentInput, each, either, joined
 from vd.vision.rivals import RIVALS, Rivals
 from vd.vision.rotations import cube_rotations, turn_angle
 from vd.vision.student import Decision, Look, Student
@@ -43,6 +43,24 @@ class StudentPolicy(Contracted):
         """How it sees, and when it stops."""
         assert self.contract.student is not None
         return self.contract.student
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What R hands see, each by one belief."""
+
+    told: Tensor
+    """What memory and head are told of it, in frames [R, S]."""
+    frame: Tensor
+    """These frames, int64 [R]."""
+    belief: Belief
+    """The better belief, base frame [R]."""
+    angle: Tensor
+    """From there to the goal [R] [rad]."""
+    doubt: Tensor
+    """How much it is doubted [R]."""
+    voxels: Tensor
+    """How many voxels of the object are seen [R]."""
 
 
 class ActingStudent:
@@ -83,39 +101,49 @@ class ActingStudent:
 
     def forget(self, fresh: Tensor) -> None:
         """Remember nothing where an episode begins, bool [N]."""
+        self.lost = self.lost | fresh
         self.hidden = self.hidden.masked_fill(fresh[:, None], 0.0)
         self._rivals.left = self._rivals.left.masked_fill(fresh, 0)
 
-    def look(self, senses: Senses, begin: Belief | None = None) -> StudentInput:
-        """What the network reads.
+    def look(self, senses: Senses, begin: Belief) -> tuple[StudentInput, Look]:
+        """What the network reads and sees; where the object then is believed to be is kept.
 
         Args:
             senses: What was sensed.
-            begin: What is believed where an episode begins [N]; None: the object is looked for.
+            begin: What is believed where an episode begins [N].
         """
         self.forget(senses.fresh)
-        self.lost = self.lost | senses.fresh
-        first = self.build.first_belief(senses.goal_quat) if begin is None else begin
-        lost = self.lost[:, None]
-        before = self.belief
-        self.belief = Belief(
-            rotation=torch.where(lost[..., None], first.rotation, before.rotation),
-            position=torch.where(lost, first.position, before.position),
-        )
-        if begin is None:
-            seen = torch.isfinite(senses.points).all(dim=-1).sum(dim=1) >= LEAST_SEEN
-            found = (self.lost & seen).nonzero()[:, 0]
-            watched = (self._rivals.left.bool() & seen).nonzero()[:, 0]
-            if len(watched):
-                self._compare(senses, watched)
-            if len(found):
-                self._search(senses, found)
-            self.lost = self.lost & ~seen
-        else:
-            self.lost = torch.zeros_like(self.lost)
-        return self.build(senses, self.belief)
+        self.belief = either(self.lost, begin, self.belief)
+        self.lost = torch.zeros_like(self.lost)
+        sight = self.build(senses, self.belief)
+        look = self.network.look(sight)
+        self.belief = self._kept(look, sight)
+        return sight, look
 
     @torch.no_grad()
+    def follow(self, senses: Senses) -> Sighting:
+        """What all hands see, whose objects are looked for where they are lost.
+
+        Where their objects then are believed to be is kept.
+        """
+        self.forget(senses.fresh)
+        seen = torch.isfinite(senses.points).all(dim=-1).sum(dim=1) >= LEAST_SEEN
+        watched = self._rivals.left.bool() & seen
+        if self.lost.any():
+            first = self.build.first_belief(senses.goal_quat)
+            self.belief = either(self.lost, first, self.belief)
+            found = self.lost & seen
+            if found.any():
+                self._search(senses, found.nonzero()[:, 0])
+            self.lost = self.lost & ~seen
+        if watched.any():
+            some = torch.arange(len(seen), device=seen.device).split(AT_ONCE // RIVALS)
+            sighting = joined([self._compare(senses, rows, watched[rows]) for rows in some])
+        else:
+            sighting = self.improved(senses, self.belief)
+        self.belief = sighting.belief
+        return sighting
+
     def _search(self, senses: Senses, rows: Tensor) -> None:
         """Believe what is doubted least of what all starts lead to, for the hands ``rows`` [R]."""
         starts = len(self._starts)
@@ -127,38 +155,43 @@ class ActingStudent:
             position = senses.points[some].nanmean(dim=1)
             belief = Belief(rotation.flatten(0, 1), position.repeat_interleave(starts, dim=0))
             for _ in range(PASSES):
-                belief, doubt = self.improved(now, belief, every)
-            self._rivals.begin(some, belief, doubt)
-            self._believe_best(some)
+                sighting = self.improved(now, belief, every)
+                belief = sighting.belief
+            self._rivals.begin(some, belief, sighting.doubt)
+            best = self._rivals.of(some, self._rivals.best(some))
+            self.belief.rotation[some] = best.rotation
+            self.belief.position[some] = best.position
 
-    @torch.no_grad()
-    def _compare(self, senses: Senses, rows: Tensor) -> None:
-        """Look by all rivals of the hands ``rows`` [R], and believe the least doubted until now."""
-        for some in rows.split(AT_ONCE // RIVALS):
-            hands, rivals = self._rivals.likely(some)
-            now = each(senses, itemgetter(hands))
-            belief, doubt = self.improved(now, self._rivals.of(hands, rivals), hands)
-            self._rivals.judge(hands, rivals, doubt)
-            self._believe_best(some)  # as it was: see() makes it better
-            self._rivals.move(hands, rivals, belief)
+    def _compare(self, senses: Senses, rows: Tensor, watched: Tensor) -> Sighting:
+        """What the hands ``rows`` [R] see, each by the belief that is then doubted least.
 
-    def _believe_best(self, rows: Tensor) -> None:
-        """Believe the best rival of each of the hands ``rows`` [R]."""
+        Those ``watched`` [R] look by all rivals that may still be right.
+        """
+        likely = self._rivals.likely(rows, watched)
+        row, rival = likely.nonzero().unbind(1)
+        hand = rows[row]
+        compared = watched[row]
+        believed = each(self.belief, itemgetter(hand))
+        belief = either(compared, self._rivals.of(hand, rival), believed)
+        sighting = self.improved(each(senses, itemgetter(hand)), belief, hand)
+        some = each(sighting, itemgetter(compared))
+        self._rivals.take(hand[compared], rival[compared], some.belief, some.doubt)
+        place = likely.flatten().cumsum(0).view_as(likely) - 1
         best = self._rivals.best(rows)
-        self.belief.rotation[rows] = best.rotation
-        self.belief.position[rows] = best.position
+        return each(sighting, itemgetter(place.gather(1, best[:, None])[:, 0]))
 
-    def improved(self, senses: Senses, belief: Belief, rows: Tensor) -> tuple[Belief, Tensor]:
-        """Better beliefs than ``belief`` of the hands ``rows``, and how much they are doubted [R]."""
+    def improved(self, senses: Senses, belief: Belief, rows: Tensor | None = None) -> Sighting:
+        """What hands see by beliefs [R]; ``rows`` as of an :class:`InputBuilder`."""
         sight = self.build(senses, belief, rows)
         look = self.network.look(sight)
-        return self._kept(look, sight), look.doubt
-
-    def see(self, sight: StudentInput) -> Look:
-        """What the network sees; where the object then is believed to be is kept."""
-        look = self.network.look(sight)
-        self.belief = self._kept(look, sight)
-        return look
+        return Sighting(
+            told=look.told,
+            frame=sight.frame,
+            belief=self._kept(look, sight),
+            angle=turn_angle(look.belief.rotation.mT @ sight.goal_rotation),
+            doubt=look.doubt,
+            voxels=look.voxels,
+        )
 
     def _kept(self, look: Look, sight: StudentInput) -> Belief:
         """What a look leaves to believe, base frame."""
@@ -175,20 +208,19 @@ class ActingStudent:
         self.hidden = decision.hidden
         return replace(decision, action=self.build.frames.joints_out(decision.action, frame))
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(self, senses: Senses) -> CameraDecision:
         """One control step."""
-        sight = self.look(senses)
-        look = self.see(sight)
-        decision = self.decide(look.told, sight.frame)
+        sighting = self.follow(senses)
+        decision = self.decide(sighting.told, sighting.frame)
         pose = self.pose
         turn = self._base[:, 3:]
-        goal = self.build.goal_rotation(senses.goal_quat)
-        angle = turn_angle(self.belief.rotation.mT @ goal)
         return CameraDecision(
             action=decision.action,
-            angle=angle.masked_fill(self.lost, torch.pi),  # or what was never seen would be stopped
+            angle=sighting.angle.masked_fill(
+                self.lost, torch.pi
+            ),  # or what was never seen would be stopped
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),
-            voxels=look.voxels,
+            voxels=sighting.voxels,
         )

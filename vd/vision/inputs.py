@@ -83,6 +83,14 @@ def joined(steps: Sequence[Step]) -> Step:
     return type(steps[0])(**values)
 
 
+def either(which: Tensor, first: Belief, second: Belief) -> Belief:
+    """The first beliefs where ``which`` [R] is, elsewhere the second [R]."""
+    return Belief(
+        rotation=torch.where(which[:, None, None], first.rotation, second.rotation),
+        position=torch.where(which[:, None], first.position, second.position),
+    )
+
+
 def carried(points: Tensor, rotation: Tensor, position: Tensor | float = 0.0) -> Tensor:
     """Points [.., P, 3] turned by matrices [.., 3, 3] and shifted by [.., 1, 3]: P R^T + p."""
     return points @ rotation.mT + position

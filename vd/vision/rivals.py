@@ -67,32 +67,31 @@ class Rivals:
             doubt = doubt.masked_fill(near, torch.inf)
         self.left[rows] = WATCHED
 
-    def likely(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Of hands ``rows`` [R] those beliefs that may still be right: hands and rivals [Q] each.
+    def likely(self, rows: Tensor, watched: Tensor) -> Tensor:
+        """By which beliefs hands ``rows`` [R] are to look now, bool [R, K].
 
-        Others are never looked at again, and where one is left it is followed no longer.
+        By those that may still be right where they are ``watched`` [R]. Others are never looked at
+        again, and where one is left it is followed no longer. Elsewhere by the best.
         """
         doubt = self.doubt[rows]
         behind = doubt > doubt.amin(dim=1, keepdim=True) + LEAD
-        self.doubt[rows] = doubt.masked_fill(behind, torch.inf)
+        self.doubt[rows] = torch.where(watched[:, None] & behind, torch.inf, doubt)
         alone = (~behind).sum(dim=1) == 1
-        self.left[rows] = torch.where(alone, 0, self.left[rows] - 1)
-        row, rival = (~behind).nonzero().unbind(1)
-        return rows[row], rival
+        left = self.left[rows]
+        self.left[rows] = torch.where(watched, (left - 1).masked_fill(alone, 0), left)
+        best = torch.nn.functional.one_hot(doubt.argmin(dim=1), RIVALS).bool()
+        return torch.where(watched[:, None], ~behind, best)
 
     def of(self, hands: Tensor, rivals: Tensor) -> Belief:
         """Beliefs of hands [Q]."""
         return Belief(self.belief.rotation[hands, rivals], self.belief.position[hands, rivals])
 
-    def judge(self, hands: Tensor, rivals: Tensor, doubt: Tensor) -> None:
-        """Take in how much a step doubts beliefs [Q]."""
-        self.doubt[hands, rivals] += doubt
-
-    def move(self, hands: Tensor, rivals: Tensor, belief: Belief) -> None:
-        """Take what a step made of beliefs [Q]."""
+    def take(self, hands: Tensor, rivals: Tensor, belief: Belief, doubt: Tensor) -> None:
+        """Take what a step made of beliefs [Q], and how much it doubts them [Q]."""
         self.belief.rotation[hands, rivals] = belief.rotation
         self.belief.position[hands, rivals] = belief.position
+        self.doubt[hands, rivals] += doubt
 
-    def best(self, rows: Tensor) -> Belief:
-        """The least doubted belief of each of hands ``rows`` [R]."""
-        return self.of(rows, self.doubt[rows].argmin(dim=1))
+    def best(self, rows: Tensor) -> Tensor:
+        """Which belief of each of hands ``rows`` [R] is doubted least, int64 [R]."""
+        return self.doubt[rows].argmin(dim=1)

@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 
 from vd.kernels.task.shapes import EXTENT_CENTRE_M, SHAPE_UNIT_M
 from vd.vision.cfg import StudentCfg
-from vd.vision.inputs import Belief, StudentInput, carried
+from vd.vision.inputs import Belief, StudentInput, carried, either
 from vd.vision.rotations import first_columns, matrices
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
 
@@ -220,11 +220,7 @@ class Student(nn.Module):
         turned = turn @ believed.rotation
         rotation = matrices(first_columns(turned))  # still a rotation after many steps
         position = believed.position + shift
-        blind = (seen == 0.0)[:, None]
-        better = Belief(
-            rotation=torch.where(blind[..., None], believed.rotation, rotation),
-            position=torch.where(blind, believed.position, position),
-        )
+        better = either(seen == 0.0, believed, Belief(rotation, position))
         of_look = torch.bincount(flow.look, minlength=looks)
         doubt = torch.segment_reduce(flow.log_scale, "mean", lengths=of_look, unsafe=True)
         return Look(self.told(sight, better).detach(), better, doubt, seen, flow)
@@ -245,11 +241,12 @@ class Student(nn.Module):
     def _flow(self, voxels: SparseTensor, levels: list[SparseTensor], pooled: Tensor) -> Flow:
         """The shifts of the goal's voxels, from the cells of all stages that hold them."""
         sites = voxels.sites
-        goal = voxels.features[:, 8] > 0.0
+        goal = (voxels.features[:, 8] > 0.0).nonzero()[:, 0]
         keys = sites.keys[goal]
-        look = sites.coordinates[goal, 0].long()
+        cells = sites.coordinates[goal]
+        look = cells[:, 0].long()
         offset = voxels.features[goal, 9:12]
-        start = self.cfg.voxel_m * (sites.coordinates[goal, 1:] + 0.5 + offset)
+        start = self.cfg.voxel_m * (cells[:, 1:] + 0.5 + offset)
         columns = [start / PLACE_M, offset, pooled[look]]
         for level in levels:
             cell = keys & ~(level.sites.step**3 - 1)
