@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain
 
 from vd.command import interrupt
@@ -21,9 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_names(cfg.agent_names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
         check_folder(cfg.out)
         if not (cfg.policies or cfg.suite):
-            words = (*cfg.agent_names, "--objects", *cfg.object_sets, "--episodes", cfg.episodes)
-            flags = flags_of(cfg, "policies", "objects", "episodes", "out")
-            say_same_as("vd-eval", *words, "--out", cfg.out, *flags)
+            full = replace(cfg, objects=cfg.object_sets)
+            flags = flags_of(full, "policies", always=("episodes", "out"))
+            say_same_as("vd-eval", *cfg.agent_names, *flags)
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
         else:
