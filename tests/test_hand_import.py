@@ -228,7 +228,8 @@ def test_the_page_of_a_hands_usd_names_every_attribute_that_is_no_common_one(toy
     page = (ROOT / "docs" / "reference" / "hand.md").read_text()
     written = set[str]()
     for path in (hand_usd("dclaw4"), toy[0].hand.path):
-        for prim in open_stage(path).TraverseAll():
+        stage = open_stage(path)
+        for prim in stage.TraverseAll():
             written.update(prim.GetAuthoredPropertyNames())
     own = {name.split(":")[-1] for name in written if name.startswith(("vd:", "newton:", "mjc:"))}
     assert len(own) > 10 and {name for name in own if f"{name}`" not in page} == set()
