@@ -100,6 +100,7 @@ def parse_stage(
     if saved is None:
         base = replace(base, teacher=asked.teacher or installed_teacher(base.teacher))
         if init := value_of(arguments, "--init") or training.stage_before(base):
+            quiet_warp()  # a student that is opened starts it
             base = replace(training.as_in(base, init), init=Path(init))
     else:
         base = saved

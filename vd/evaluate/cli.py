@@ -8,6 +8,7 @@ from itertools import chain
 from vd.command import interrupt
 from vd.command.files import check_file, check_folder
 from vd.command.line import flags_of, parse, say_same_as
+from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
 from vd.policy.agents import check_names
@@ -42,6 +43,7 @@ def _evaluate(cfg: EvalCfg) -> int:
     from vd.evaluate.spin import SPIN_FILE, evaluate_spin, spins
     from vd.evaluate.suite_run import run_suite
 
+    quiet_warp()
     policies = {} if cfg.suite else open_agents(cfg)
     if any(map(spins, policies.values())):
         print(f"{evaluate_spin(cfg, policies).text()}\n{cfg.out / SPIN_FILE}")
