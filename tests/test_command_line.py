@@ -19,12 +19,12 @@ from vd.train.stages import parse_stage
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 LINES = {
-    "vd-eval": "zero --objects cube cuboid --in-air --table-friction 3e-1",
-    "vd-play": "zero --video a.mp4",
+    "vd-eval": "zero --objects cube cuboid --in-air --at-rest --table-friction 3e-1",
+    "vd-play": "zero --video a.mp4 --in-air",
     "vd-train teacher": "--preset gpu --hand dclaw3 --ppo.actor-learning-rate 3e-5 --randomise",
     "vd-train alignment": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
-    "vd-train student": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
-    "vd-train tracker": "dclaw3 --objects cube",
+    "vd-train student": "--preset cpu-demo --validate cube --smoke",
+    "vd-train tracker": "dclaw3 --objects cube --in-air",
     "vd-train export": "a.pt b.safetensors",
     "vd-gap run": "rec --effects backlash --model a.usda",
     "vd-gap hide": "servo --out rec --effect backlash:width_rad=0.06 --effect dead_zone",
@@ -86,6 +86,9 @@ def test_a_file_that_cannot_be_used_is_refused_by_name(line, text, tmp_path, run
 
 def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     path = tmp_path / "run.yaml"
+    path.write_text("at_rest: true")
+    values = yaml.safe_load(run(f"vd-eval zero --config={path} --no-at-rest --print-config")[1])
+    assert values["no_at_rest"] and not values["at_rest"]
     path.write_text(
         "objects: [cuboid]\nin_air: true\nair_goals: true\ntable_friction: 3e-1\npolicies: [random]"
     )

@@ -132,7 +132,7 @@ def test_progress_counts_what_is_done_and_shows_no_share_of_what_nobody_knows(
     recording = recorded({servo.COULOMB_TORQUE: 0.05})
     analysed(recording, tmp_path, effects=("coulomb_friction",), progress=lines.append)
     assert lines[0].startswith("find: j (1 of 1): baseline") and "%" not in "".join(lines)
-    done = re.findall(r"explain: j \(1 of 1\): (\d+) tasks done", "\n".join(lines))
+    done = re.findall(r"explain: j \(1 of 1\): fits done: (\d+)", "\n".join(lines))
     assert len(done) > 2 and sorted({*map(int, done)}) == [*map(int, done)]
 
 

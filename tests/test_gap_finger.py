@@ -10,7 +10,7 @@ import vd.kernels.servo.actuators as servo
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
-from vd.gap.workflow import explain
+from vd.gap.workflow import explain, find
 from vd.logs.recording import Recording, Trajectory
 
 JOINTS = ("f0_j1", "f0_j2", "f0_j3")
@@ -53,6 +53,14 @@ def recorded(factors: tuple[float, float, float], friction: float) -> Recording:
         for i, t in enumerate(recording.trajectories)
     ]
     return replace(recording, trajectories=tuple(parts))
+
+
+def test_no_line_of_progress_is_that_of_another(tmp_path: Path) -> None:
+    lines: list[str] = []
+    hand = load_hand("dclaw3")
+    find(recorded((1.0, 1.0, 1.0), 0.0), hand, tmp_path, workers=1, progress=lines.append)
+    fitted = [line.partition(": baseline")[0] for line in lines if ": baseline" in line]
+    assert len(fitted) >= len(JOINTS) and len({*fitted}) == len(fitted)
 
 
 @pytest.mark.slow

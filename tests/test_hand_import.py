@@ -28,7 +28,7 @@ from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage, read_hand
-from vd.assets_usd.hands import load_hand
+from vd.assets_usd.hands import hand_usd, load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
@@ -40,6 +40,7 @@ from vd.sim.simulator import Simulator
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def link(name: str, length: float, shape: str = "", *, mass: float = 0.03) -> str:
@@ -221,6 +222,17 @@ class HandWorld:
         state.joint_q.assign(q.astype(np.float32))
         newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
         return state.body_q.numpy()
+
+
+def test_the_page_of_a_hands_usd_names_every_attribute_that_is_no_common_one(toy):
+    page = (ROOT / "docs" / "reference" / "hand.md").read_text()
+    written = set[str]()
+    for path in (hand_usd("dclaw4"), toy[0].hand.path):
+        stage = open_stage(path)
+        for prim in stage.TraverseAll():
+            written.update(prim.GetAuthoredPropertyNames())
+    own = {name.split(":")[-1] for name in written if name.startswith(("vd:", "newton:", "mjc:"))}
+    assert len(own) > 10 and {name for name in own if f"{name}`" not in page} == set()
 
 
 def test_newton_reads_the_same(toy):

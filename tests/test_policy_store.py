@@ -33,8 +33,9 @@ def test_a_pulled_policy_has_a_name_and_nothing_takes_its_place_unasked(place, c
     push = ["push", "dclaw4", "--at", str(place), "--name"]
     assert main(pull) == main(pull) == main(["list", "--at", str(place)]) == 0
     assert find_policy("mine") == pulled_folder() / "mine.safetensors"
-    line = r"^mine +teacher +dclaw4 +0\.5 MB  cube, 0\.95 to 1\.05 times"
-    assert re.search(line, capsys.readouterr().out, re.MULTILINE)
+    listed = capsys.readouterr().out
+    assert re.search(r"^mine +teacher +dclaw4 +0\.5 MB  cube$", listed, re.MULTILINE)
+    assert re.search(r"^leap-cube .* cube, 5 sizes from the hand's smallest ", listed, re.MULTILINE)
 
     assert "another policy" in refused(capsys, *push, "mine")
     assert main([*push, "mine", "--replace"]) == main([*push, "mine"]) == 0

@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ LONG = {
     "vd-deploy --hand leap --twin": "vd.deploy.loop.policy_runner.load_runner",
     "vd-deploy --hand leap --twin --safety.misses 12": "vd.deploy.loop.policy_runner.load_runner",
     "vd-eval": "vd.evaluate.cli._evaluate",
-    "vd-eval --hand dclaw3 --seed 3 --in-air": "vd.evaluate.cli._evaluate",
+    "vd-eval --hand dclaw3 --in-air --out=-x": "vd.evaluate.cli._evaluate",
     "vd-play": "vd.play.cli._session",
     "vd-play --hand dclaw3 --cells 4": "vd.play.cli._session",
     "vd-gap run REC": "vd.gap.steps.Analysis.run",
@@ -58,22 +59,22 @@ LONG = {
 """Where each command is ended."""
 TAKEN = {
     "vd-train teacher": "teacher --preset cpu-demo --hand dclaw3 --objects cube --out runs/cpu-demo",
-    "vd-train student": "--stage 0 --preset cpu-demo --teacher dclaw4-cube --out runs/student/cpu",
-    "vd-train student --stage 0": "--stage 0 --preset cpu-demo --teacher dclaw4-cube",
-    "vd-train student --stage 1": "--stage 1 --preset cpu-demo --teacher dclaw4-cube --out runs/",
-    "vd-train student --stage 2": "--stage 2 --preset cpu-demo --teacher dclaw4-cube --out runs/",
-    "vd-train alignment": "--stage 0 --preset cpu-demo --teacher dclaw4-cube --out runs/alignment/cpu",
-    "vd-train alignment --stage 1": "--preset cpu-demo --teacher dclaw4-cube --init dclaw4-vision",
+    "vd-train student": "--preset cpu-demo --stage 0 --teacher dclaw4-cube --out runs/student/cpu",
+    "vd-train student --stage 0": "--preset cpu-demo --stage 0 --teacher dclaw4-cube",
+    "vd-train student --stage 1": "--preset cpu-demo --stage 1 --teacher dclaw4-cube --out runs/",
+    "vd-train student --stage 2": "--preset cpu-demo --stage 2 --teacher dclaw4-cube --out runs/",
+    "vd-train alignment": "--preset cpu-demo --stage 0 --teacher dclaw4-cube --out runs/alignment/cpu",
+    "vd-train alignment --stage 1": "--stage 1 --teacher dclaw4-cube --init dclaw4-vision",
     "vd-train adapt": "adapt dclaw3 --hand-layer gap/identified.usda --objects cube --num-envs 256",
     "vd-train adapt --steps 900 --seed 3": "--steps 900 --max-minutes 7.0 --seed 3",
-    "vd-train tracker --seed 3": "-seed0 --episodes 64 --out tracking.safetensors --seed 3",
+    "vd-train tracker --seed 3": "-seed0 --seed 3 --episodes 64 --out tracking.safetensors",
     "vd-deploy --twin": "dclaw3-vision --hand dclaw3 --object cube --twin   (3 goals)",
     "vd-deploy --hand dclaw3": "dclaw3-vision --hand dclaw3 --object cube --port {}/ttyUSB0",
     "vd-deploy --hand dclaw4": "dclaw4-vision --hand dclaw4 --object cube --port {}/ttyUSB0",
     "vd-deploy --hand leap --twin": "leap-cube --hand leap --object cube --twin",
     "vd-deploy --hand leap --twin --safety.misses 12": "--twin --safety.misses 12   (",
     "vd-eval": "vd-eval dclaw4 --objects cube --episodes 20 --out runs/eval",
-    "vd-eval --hand dclaw3 --seed 3 --in-air": "--out runs/eval --seed 3 --in-air --hand dclaw3",
+    "vd-eval --hand dclaw3 --in-air --out=-x": "--in-air --episodes 20 --hand dclaw3 --out=-x",
     "vd-play": "vd-play dclaw4 --objects cube",
     "vd-play --hand dclaw3 --cells 4": "cube --port 8080 --hand dclaw3 --cells 4",
     "vd-gap run REC": "vd-gap run REC",
@@ -142,13 +143,38 @@ def test_a_seed_that_cannot_be_is_refused_before_anything_is_built(command, type
     assert not list((tmp_path / "runs").rglob("*"))
 
 
-def test_what_is_said_asks_for_the_same(typed, monkeypatch):
+RUNS = {
+    "teacher": (parse_teacher, []),
+    "teacher with flags": (
+        parse_teacher,
+        [
+            *("--randomise", "--num-envs", "64", "--seed", "3", "--resume", "auto", "--out=-x"),
+            *("--env.randomisation.effects", "backlash.width_rad", "0", "0.03"),
+            *("--max-minutes", "3", "--ppo.gamma", "0.9", "--logger", "none"),
+        ],
+    ),
+    "student": (
+        partial(parse_stage, STUDENT),
+        ["--smoke", "--stage", "2", "--camera-range", "0", "0"],
+    ),
+    "student on a GPU": (
+        partial(parse_stage, STUDENT),
+        ["--preset", "gpu", "--objects", "cube", "--teacher", "dclaw3", "--max-steps", "9"],
+    ),
+    "alignment": (partial(parse_stage, ALIGNMENT), ["--stage", "1"]),
+    "alignment with flags": (
+        partial(parse_stage, ALIGNMENT),
+        ["--device", "cpu", "--align.network.tokens", "32", "--save-every", "7", "--out=-x"],
+    ),
+}
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_what_is_said_asks_for_the_same(run, typed):
+    parse, flags = RUNS[run]
     said: list[str] = []
-    alone = parse_teacher([], say=lambda *words, why: said.extend(map(str, words)))
-    assert parse_teacher(said[2:]) == alone and alone.run.device == "cpu"
-    alone = parse_stage(ALIGNMENT, ["--stage", "1"])
-    flags = ["--preset", "cpu-demo", "--teacher", "dclaw4-cube", "--init", "dclaw4-vision"]
-    assert parse_stage(ALIGNMENT, ["--stage", "1", *flags]) == alone
+    asked = parse(flags, say=lambda *words, why="": said.extend(map(str, words)))
+    assert parse(said[2:]) == asked and run.startswith(said[1])
 
 
 def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, monkeypatch):

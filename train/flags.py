@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
@@ -12,7 +13,7 @@ import tyro
 from vd.command.config import from_dict, to_dict
 from vd.command.device import resolve_device
 from vd.command.files import write_json
-from vd.command.line import PRINT, ConfigFile, parse, take_config
+from vd.command.line import PRINT, ConfigFile, flags_of, parse, take_config
 from vd.policy.agents import DEFAULT_POLICY, check_names, installed_policies
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
@@ -113,7 +114,9 @@ def parse_teacher(
     cfg = _parsed(arguments, base, file)
     if say is not None and chosen:
         words = ("--preset", preset, "--hand", cfg.env.hand, "--objects", *cfg.env.objects)
-        say("vd-train", "teacher", *words, "--out", cfg.run.out, why=WHY[str(preset)])
+        flags = flags_of(cfg.run, always=("out",), over=base.run)
+        flags += flags_of(cfg, "preset", "run", "env.hand", "env.objects", over=base)
+        say("vd-train", "teacher", *words, *flags, why=WHY[str(preset)])
     return cfg
 
 
@@ -164,7 +167,7 @@ def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
 
 
 def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[str]:
-    """Spell out flags in their short forms, ``--flag=value``, and a bare ``--resume``."""
+    """Spell out flags in their short forms, and a bare ``--resume``."""
     result: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
@@ -176,7 +179,7 @@ def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[
         if name in short_forms or off:
             group, _, field = short_forms[name[3:] if off else name].rpartition(".")
             name = f"{group}.{'no-' if off else ''}{field}"
-        result += [f"--{name}", value] if equals else [f"--{name}"]
+        result.append(f"--{name}{equals}{value}")
     if "--resume" in result:
         after = result.index("--resume") + 1
         if after == len(result) or result[after].startswith("--"):
@@ -185,9 +188,13 @@ def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[
 
 
 def value_of(arguments: list[str], flag: str) -> str | None:
-    """Value after the last ``flag``, or ``None``."""
-    places = [index for index, argument in enumerate(arguments[:-1]) if argument == flag]
-    return arguments[places[-1] + 1] if places else None
+    """Value after the last ``flag``, or behind its ``=``, or ``None``."""
+    found = None
+    for argument, after in zip_longest(arguments, arguments[1:]):
+        name, equals, value = argument.partition("=")
+        if name == flag:
+            found = value if equals else after
+    return found
 
 
 def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) -> TeacherCfg:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from vd.command.device import resolve_device
 from vd.command.files import check_folder
-from vd.command.line import PRINT, ConfigFile, parse, say_same_as
+from vd.command.line import PRINT, ConfigFile, flags_of, parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.paper import PAPER
@@ -71,8 +71,15 @@ class StagedTraining(Generic[Cfg]):
     """File in the run's folder that holds what was learned."""
 
 
-def parse_stage(training: StagedTraining[Cfg], flags: Sequence[str]) -> Cfg:
+def parse_stage(
+    training: StagedTraining[Cfg],
+    flags: Sequence[str],
+    *,
+    say: Callable[..., object] | None = None,
+) -> Cfg:
     """The configuration that command-line flags ask for.
+
+    ``say`` (:func:`vd.command.line.say_same_as`) is told it.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own
     configuration with ``--resume``, the network to begin from), as flags and ``--config`` say; the
@@ -89,14 +96,21 @@ def parse_stage(training: StagedTraining[Cfg], flags: Sequence[str]) -> Cfg:
     preset = value_of(arguments, "--preset") or machine_preset(value_of(arguments, "--device"))
     start = training.smoke if "--smoke" in arguments else training.presets[preset]
     base = start(asked.stage)
-    if "--resume" in arguments:
-        saved = saved_config(arguments, base)
-        if saved is not None:
-            return _parsed(training, arguments, saved, file)
-    base = replace(base, teacher=asked.teacher or installed_teacher(base.teacher))
-    if init := value_of(arguments, "--init") or training.stage_before(base):
-        base = replace(training.as_in(base, init), init=Path(init))
-    return _parsed(training, arguments, base, file)
+    saved = saved_config(arguments, base) if value_of(arguments, "--resume") else None
+    if saved is None:
+        base = replace(base, teacher=asked.teacher or installed_teacher(base.teacher))
+        if init := value_of(arguments, "--init") or training.stage_before(base):
+            quiet_warp()  # a student that is opened starts it
+            base = replace(training.as_in(base, init), init=Path(init))
+    else:
+        base = saved
+    cfg = _parsed(training, arguments, base, file)
+    if say is not None:
+        over = replace(base, init=None, smoke=False)
+        said = flags_of(cfg, "run", always=("preset", "stage", "teacher"), over=over)
+        said += flags_of(cfg.run, always=("out",), over=base.run)
+        say("vd-train", training.name, *said)
+    return cfg
 
 
 def _parsed(
@@ -115,12 +129,7 @@ def _parsed(
 
 def run_stage(training: StagedTraining[Cfg], arguments: list[str]) -> int:
     """The command; its exit status."""
-    cfg = parse_stage(training, arguments)
-    if is_main():
-        words: list[object] = ["--stage", cfg.stage, "--preset", cfg.preset]
-        words += ["--teacher", cfg.teacher]
-        words += [] if cfg.init is None else ["--init", cfg.init]
-        say_same_as("vd-train", training.name, *words, "--out", cfg.run.out)
+    cfg = parse_stage(training, arguments, say=say_same_as if is_main() else None)
     with run_folder(cfg) as own:
         return train_stage(own, training)
 

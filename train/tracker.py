@@ -87,12 +87,11 @@ def with_defaults(cfg: TrackerCfg) -> TrackerCfg:
     """``cfg`` with objects and episodes for this machine where none are named, which are said."""
     few = resolve_device(cfg.device) == "cpu"
     objects = cfg.objects or (("procedural-heldout-8-seed0",) if few else ("procedural-heldout",))
-    episodes = cfg.episodes or (64 if few else 256)
-    if not (cfg.objects and cfg.episodes):
-        words = (cfg.teacher, "--objects", *objects, "--episodes", episodes, "--out", cfg.out)
-        flags = flags_of(cfg, "teacher", "objects", "episodes", "out")
-        say_same_as("vd-train", "tracker", *words, *flags)
-    return replace(cfg, objects=objects, episodes=episodes)
+    full = replace(cfg, objects=objects, episodes=cfg.episodes or (64 if few else 256))
+    if full != cfg:
+        flags = flags_of(full, "teacher", always=("out",))
+        say_same_as("vd-train", "tracker", cfg.teacher, *flags)
+    return full
 
 
 def _track(cfg: TrackerCfg) -> int:

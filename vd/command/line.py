@@ -11,6 +11,7 @@ import sys
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,7 +55,7 @@ class ConfigFile:
             for name in path.split("."):
                 value = value.get(name) if isinstance(value, Mapping) else None
             if value is not None and value is not False:
-                words += [flag] if value is True else [flag, str(value)]
+                words.append(flag if value is True else f"{flag}={value}")
         return words
 
 
@@ -88,7 +89,7 @@ def parse(
         description = None
     if file is not None and isinstance(kind, type):
         default = file.over(default or kind(**dict.fromkeys(needed(kind), tyro.MISSING)))
-        arguments = [word for word in arguments if word not in _set_already(default, arguments)]
+        default, arguments = _switched(default, arguments)
     shown = PRINT in arguments
     cfg = tyro.cli(
         kind,
@@ -172,40 +173,60 @@ def _subcommands(kind: Any) -> dict[str, Any]:
     return commands
 
 
-def _set_already(default: Any, words: Sequence[str]) -> set[str]:
-    """Switches that are on already: tyro knows some of these by their opposite alone."""
-    flags = set()
-    for field in dataclasses.fields(default):
-        name = field.name.replace("_", "-")
-        if getattr(default, field.name) is True and f"--no-{name}" not in words:
-            flags.add(f"--{name}")
-    return flags
+def _switched(settings: Any, words: Sequence[str]) -> tuple[Any, list[str]]:
+    """Switches that a file turns on, typed before ``words``: tyro would know some by --no- alone."""
+    left = list(words)
+    off = {}
+    for field in dataclasses.fields(settings):
+        if getattr(settings, field.name) is not True or field.default is not False:
+            continue
+        off[field.name] = False
+        flag = field.name.replace("_", "-")
+        if f"--no-{flag}" not in words:
+            left.insert(0, f"--{flag}")
+        elif not hasattr(settings, f"no_{field.name}"):
+            left.remove(f"--no-{flag}")
+    return dataclasses.replace(settings, **off), left
 
 
-def flags_of(settings: Any, *without: str, group: str = "") -> list[str]:
+def flags_of(
+    settings: Any, *without: str, always: Sequence[str] = (), over: Any = None, group: str = ""
+) -> list[str]:
     """The flags that ask for settings which are not their defaults.
 
     Args:
         settings: A dataclass, with groups in it.
-        without: Fields that are left out.
+        without: Flags that are left out.
+        always: Flags that ask for their defaults too.
+        over: Settings that count as the defaults.
         group: Begin of the flags' names.
     """
     words = list[str]()
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
+        before = getattr(over, field.name, field.default)
         flag = group + field.name.replace("_", "-")
+        if flag in without:
+            continue
         if dataclasses.is_dataclass(value):
-            words += flags_of(value, group=f"{flag}.")
-        elif field.name in without or field.default in (value, dataclasses.MISSING):
+            words += flags_of(value, *without, over=before, group=f"{flag}.")
+        elif before in (value, dataclasses.MISSING) and flag not in always:
             continue
         elif isinstance(value, bool):
             words.append(f"--{group}{'' if value else 'no-'}{flag.removeprefix(group)}")
-        elif isinstance(value, tuple):
-            words += [f"--{flag}", *map(str, value)]
+        elif isinstance(value, (tuple, Mapping)):
+            words += [f"--{flag}", *_typed(value)]
         else:
             text = str(value)  # one that begins as a flag does is no value but behind =
             words += [f"--{flag}={text}"] if text.startswith("-") else [f"--{flag}", text]
     return words
+
+
+def _typed(value: Any) -> list[str]:
+    """A value's words: of a mapping each name and what it names."""
+    if isinstance(value, Mapping):
+        value = tuple(value.items())
+    return list(chain(*map(_typed, value))) if isinstance(value, tuple) else [str(value)]
 
 
 def say_same_as(*words: object, why: str = "") -> None:

@@ -2,11 +2,13 @@
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain
 
 from vd.command import interrupt
 from vd.command.files import check_file, check_folder
 from vd.command.line import flags_of, parse, say_same_as
+from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
 from vd.policy.agents import check_names
@@ -21,9 +23,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_names(cfg.agent_names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
         check_folder(cfg.out)
         if not (cfg.policies or cfg.suite):
-            words = (*cfg.agent_names, "--objects", *cfg.object_sets, "--episodes", cfg.episodes)
-            flags = flags_of(cfg, "policies", "objects", "episodes", "out")
-            say_same_as("vd-eval", *words, "--out", cfg.out, *flags)
+            full = replace(cfg, objects=cfg.object_sets)
+            flags = flags_of(full, "policies", always=("episodes", "out"))
+            say_same_as("vd-eval", *cfg.agent_names, *flags)
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
         else:
@@ -41,6 +43,7 @@ def _evaluate(cfg: EvalCfg) -> int:
     from vd.evaluate.spin import SPIN_FILE, evaluate_spin, spins
     from vd.evaluate.suite_run import run_suite
 
+    quiet_warp()
     policies = {} if cfg.suite else open_agents(cfg)
     if any(map(spins, policies.values())):
         print(f"{evaluate_spin(cfg, policies).text()}\n{cfg.out / SPIN_FILE}")

@@ -133,7 +133,7 @@ def change(report: Report) -> str:
     after = held.identified_rmse_rad
     text = (
         f"With {names} the error on motions held out {_goes(before, after)} "
-        f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); where it was fitted "
+        f"({percent(held.reduction)} closed, 95 %: {percent_range(held.ci95)}); where it was fitted "
         f"it {_goes(report.baseline.rmse_rad, report.identified.rmse_rad)}."
     )
     return text + _judged(report)

@@ -136,7 +136,6 @@ def explain(
     report, predictions = assemble(problems, joints, misfits, chosen.seed)
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
-    chosen.progress(f"explain: {report.verdict}")
     return report
 
 
@@ -166,7 +165,7 @@ class _JointAnalysis:
         """Results of calls of the joint's problem, with a line of progress."""
         result = self.pool.run(self.spec, calls)
         self.done += len(calls)
-        self.options.progress(f"explain: {self.place}: {self.done} tasks done")
+        self.options.progress(f"explain: {self.place}: fits done: {self.done}")
         return result
 
     def run(self, rows: np.ndarray, others: Sequence[AnalysedJoint]) -> AnalysedJoint:
@@ -292,7 +291,7 @@ def _identify(
             if other.chain == spec.chain:
                 rows[other.joint] = its.rows[other.joint]
         beside.append(rows)
-    return _plain(pool, chains, specs, beside, options)
+    return _plain(pool, chains, specs, beside, options, " beside the others")
 
 
 def _plain(
@@ -301,13 +300,17 @@ def _plain(
     specs: Sequence[JointSpec],
     bases: Sequence[np.ndarray],
     options: Options,
+    how: str = "",
 ) -> list[JointFit]:
-    """Plain models of joints, each beside the rows of its chain [n, PARAMETER_COLUMNS]."""
+    """Plain models of joints, each beside the rows of its chain [n, PARAMETER_COLUMNS].
+
+    ``how`` is told behind the name of each.
+    """
     fits = []
     for spec, base in zip(specs, bases, strict=True):
         ((fit, _),) = pool.run(spec, [partial(JointProblem.plain, base=base)])
         fits.append(fit)
-        name = f"{chains[spec.chain].joints[spec.joint]} ({len(fits)} of {len(specs)})"
+        name = f"{chains[spec.chain].joints[spec.joint]}{how} ({len(fits)} of {len(specs)})"
         line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
         options.progress(f"find: {name}: {line}")
     return fits

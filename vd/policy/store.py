@@ -6,7 +6,7 @@ content, so a damaged one is refused.
 
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -163,8 +163,7 @@ class List:
         for name, path in installed.items():
             contract = installed_contract(path)
             size = f"{path.stat().st_size / 1e6:5.1f} MB"
-            low, high = contract.task["randomisation"]["object_scale"]
-            objects = f"{', '.join(contract.task['objects'])}, {low:g} to {high:g} times their size"
+            objects = ", ".join(contract.task["objects"]) + _sizes(contract.task["randomisation"])
             print(f"{name:<24} {contract.kind:<9} {contract.task['hand']:<10} {size}  {objects}")
         if self.at is None:
             return 0
@@ -172,6 +171,16 @@ class List:
             if name not in installed:
                 print(f"{name:<24} vd-policies pull {name} --at {self.at}")
         return 0
+
+
+def _sizes(drawn: Mapping[str, Any]) -> str:
+    """In what other sizes than their own objects were drawn."""
+    if not drawn["enabled"]:
+        return ""
+    if count := drawn.get("object_sizes"):
+        return f", {count} sizes from the hand's smallest to its largest"
+    low, high = drawn["object_scale"]
+    return "" if low == high == 1.0 else f", {low:g} to {high:g} times their size"
 
 
 @dataclass(frozen=True)
