@@ -50,12 +50,13 @@ def test_every_stored_figure_of_a_suite_has_its_command_line():
         entries = yaml.safe_load(path.read_text())["lines"]
         for entry in entries:
             if "command" in entry:
-                parse(Command, shlex.split(entry["command"])[1:], prog="vd-bench")
+                script, *words = shlex.split(entry["command"])
+                parse({"vd-bench": Command, "vd-eval": EvalCfg}[script], words, prog=script)
         if "command" not in entries[0]:
             for entry in read_suite(str(path)).lines:
                 for line in entry.lines:
                     suite_run.settings(EvalCfg(), line, "zero", _any_objects(line)).validate()
-        names = {entry["name"] for entry in entries}
+        names = {entry["name"].split("/")[0] for entry in entries}
         assert {key.split("/")[0] for key in json.loads(stored.read_text())} <= names
 
 
@@ -148,6 +149,29 @@ def test_a_battery_of_the_gap_goes_on_and_is_of_its_own_code(folder, monkeypatch
     stored = json.loads((folder / "x.json").read_text())["a"]
     assert stored["seed"] == 0 and stored["code"] == code_fingerprint(GAP) != code_fingerprint()
     assert stored["visual-dexterity"] and stored["date"] and stored["command"] == line
+
+
+def test_turns_are_stored_with_their_policy_and_code(folder, monkeypatch):
+    def turned(words):
+        out = Path(words[words.index("--out") + 1])
+        write_json(out / "spin.json", {"rows": [{"revolutions": 2.41}]})
+        return subprocess.CompletedProcess(words, 0)
+
+    suite = folder / "x.yaml"
+    suite.write_text("title: X\nlines: [{name: a/zero, command: vd-eval zero --objects cube}]\n")
+    tables = folder / "tables.yaml"
+    cell = "{x/a/zero: overall/outcomes/success}"
+    tables.write_text(tables.read_text().replace(cell, "{x/a/zero: revolutions}"))
+    monkeypatch.setattr(subprocess, "run", turned)
+    monkeypatch.setattr("sys.argv", ["figures.py", "run", "x", "--out", str(folder / "out")])
+    assert figures.main() == 0
+    assert figures.collect("x", folder / "out") == 1
+    (page,) = figures.tables().values()
+    assert "|a|2.4|" in page
+    stored = json.loads((folder / "x.json").read_text())["a/zero"]
+    (folder / "x.json").write_text(json.dumps({"a/zero": stored | {"policy": "other"}}))
+    (page,) = figures.tables().values()
+    assert figures.STALE in page
 
 
 NOTHING = {"sets": [], "false": [], "found": [], "gap": 1.0, "left": 1.0, "shrunk": None}
