@@ -9,14 +9,17 @@ column. None of the others may differ, and of all pixels one in a thousand.
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 from newton.sensors import SensorCamera
 from posed_scenes import pose, posed_scene
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from vd.assets_usd.objects.geometry import Surface
 from vd.assets_usd.objects.sets import load_set
 from vd.paper import PAPER
+from vd.sensors import surfaces
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.depth_cloud import CameraCloud
@@ -294,3 +297,15 @@ def test_a_camera_goes_on_where_another_stopped(device, scenes):
     )
     np.testing.assert_array_equal(host(other.depth), host(one.depth))
     np.testing.assert_array_equal(host(other.points), host(one.points))
+
+
+def test_a_link_of_many_triangles_is_drawn_coarser_and_looks_the_same():
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.02)
+    fine = Surface(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
+    coarse = surfaces.coarse(fine)
+    assert len(coarse.faces) < 0.5 * len(fine.faces)
+    mesh = trimesh.Trimesh(*coarse, process=False)
+    points, _ = trimesh.sample.sample_surface(mesh, 5000, seed=0)
+    assert np.abs(np.linalg.norm(points, axis=1) - 0.02).max() < 1e-3
+    few = Surface(fine.vertices, fine.faces[: surfaces.MANY_FACES])
+    assert surfaces.coarse(few) is few

@@ -4,11 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
+from trimesh import Trimesh
 from trimesh.util import append_faces
 
 from vd.assets_usd.hand_model import read_surfaces
 from vd.assets_usd.objects.geometry import Surface
 from vd.sim.scene import Scene
+
+MANY_FACES = 4000
+"""A link with more triangles is drawn coarser: each costs time, and CAD files have many times more
+than pixels of 2 mm tell apart."""
+COARSE_DIGITS = 3
+"""Decimals of a metre in which vertices of such a link differ."""
 
 
 class SurfaceSet:
@@ -84,7 +91,7 @@ def scene_surfaces(scene: Scene) -> SurfaceSet:
             meshes.append(surface)
         return known[key]
 
-    links = list(map(index, drawn.values()))
+    links = [index(coarse(surface)) for surface in drawn.values()]
     places = np.array([index(Surface(item.vertices, item.faces)) for item in scene.objects])
     shape_mesh = np.column_stack([np.tile(links, (scene.num_envs, 1)), places[scene.world_object]])
     shape_scale = np.ones(shape_mesh.shape)
@@ -92,3 +99,13 @@ def scene_surfaces(scene: Scene) -> SurfaceSet:
     bodies = [*(scene.link_body[link] for link in drawn), scene.object_body]
     device = str(scene.model.device)
     return SurfaceSet(meshes, np.array(bodies), shape_mesh, shape_scale, device=device)
+
+
+def coarse(surface: Surface) -> Surface:
+    """A surface of many triangles with vertices merged where no camera tells them apart."""
+    if len(surface.faces) <= MANY_FACES:
+        return surface
+    mesh = Trimesh(*surface, process=False)
+    mesh.merge_vertices(digits_vertex=COARSE_DIGITS)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    return Surface(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
