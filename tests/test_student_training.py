@@ -330,6 +330,11 @@ def test_objects_of_a_teacher_that_are_not_here_are_to_be_named(monkeypatch, tmp
         trainer_of(replace(settings(1, tmp_path), task=StageTaskCfg()))
 
 
+def test_a_teacher_without_goals_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="leap-spin has no goals"):
+        trainer_of(replace(settings(1, tmp_path), teacher="leap-spin"))
+
+
 def test_shapes_that_are_made_have_the_sizes_that_the_hand_holds(unlike, tmp_path):
     trainer = trainer_of(replace(settings(0, tmp_path), teacher=unlike))
     assert trainer.source.collect(trainer.acting, lambda: False)
@@ -341,7 +346,11 @@ def test_shapes_that_are_made_have_the_sizes_that_the_hand_holds(unlike, tmp_pat
 
 
 def test_the_eyes_of_another_hands_student_are_gone_on_from(policy, unlike, tmp_path):
-    trainer = trainer_of(replace(settings(0, tmp_path), teacher=unlike, init=policy))
+    begun = replace(settings(0, tmp_path), teacher=unlike, init=policy)
+    wider = replace(begun.student, flow=2 * begun.student.flow)
+    with pytest.raises(ValueError, match="another size; leave out --student"):
+        trainer_of(replace(begun, student=wider))
+    trainer = trainer_of(begun)
     eyes = read_policy(policy).network
     assert trainer.network.num_actions != eyes.num_actions
     for name in ("stages", "flow"):

@@ -57,6 +57,7 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, capsys, gpus,
     assert f"preset: {name}\n" in capsys.readouterr().out
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
+    assert parse_teacher(["--smoke", "--no-smoke"]) == parse_teacher([])
     tiny = smoke(PRESETS["leap-cube"]())
     assert (
         tiny.smoke

@@ -89,7 +89,7 @@ def parse_teacher(
     resume = value_of(arguments, "--resume")
     out = value_of(arguments, "--out")
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
-    small = "--smoke" in arguments
+    small = is_on(arguments, "smoke")
     if preset is not None and preset not in PRESETS:
         raise ValueError(f"--preset {preset} is none; one of {', '.join(PRESETS)}")
     chosen = False
@@ -156,7 +156,7 @@ def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
         ValueError: Names the flag, what the run began with, and the remedy.
     """
     asked = {name: value_of(arguments, f"--{name}") for name in ("preset", "init", "stage")}
-    asked["smoke"] = "True" if "--smoke" in arguments else None
+    asked["smoke"] = "True" if is_on(arguments, "smoke") else None
     for name, value in asked.items():
         begun = getattr(saved, name, None)
         if value not in (None, str(begun)):
@@ -185,6 +185,12 @@ def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[
         if after == len(result) or result[after].startswith("--"):
             result.insert(after, "latest")
     return result
+
+
+def is_on(arguments: list[str], name: str) -> bool:
+    """Whether a switch is on: the last of it and its negation counts."""
+    said = [word for word in arguments if word in (f"--{name}", f"--no-{name}")]
+    return said[-1:] == [f"--{name}"]
 
 
 def value_of(arguments: list[str], flag: str) -> str | None:

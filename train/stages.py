@@ -16,6 +16,7 @@ from vd.policy.agents import check_names
 from vd.train.config import StageTaskCfg
 from vd.train.flags import (
     installed_teacher,
+    is_on,
     machine_preset,
     normalise,
     saved_config,
@@ -94,7 +95,7 @@ def parse_stage(
     words = [word for word in arguments if word != PRINT]
     asked = _parsed(training, words, training.presets["gpu"](0), file)
     preset = value_of(arguments, "--preset") or machine_preset(value_of(arguments, "--device"))
-    start = training.smoke if "--smoke" in arguments else training.presets[preset]
+    start = training.smoke if is_on(arguments, "smoke") else training.presets[preset]
     base = start(asked.stage)
     saved = saved_config(arguments, base) if value_of(arguments, "--resume") else None
     if saved is None:
@@ -142,7 +143,7 @@ def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
     if trainer.iteration:
         say(f"resumed after iteration {trainer.iteration} of {trainer.total_iterations}")
     elif cfg.init is not None:
-        say(f"begins with the weights of {cfg.init}")
+        say(f"begins from {cfg.init}")
     elif cfg.stage:
         say(f"begins from nothing: stage {cfg.stage - 1} was not trained; --init names a network")
     return train_to_end(cfg, trainer, training.name, training.result, say)
@@ -217,11 +218,14 @@ def build_stage(
 
     quiet_warp()  # a line for each of some hundred kernels would scroll the progress away
     from vd.command.workers import one_thread_without_gpu
+    from vd.evaluate.spin import spins
     from vd.policy.agents import open_teacher
 
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"--teacher {cfg.teacher} has no layers; give a trained teacher")
+    if spins(teacher):
+        raise ValueError(f"--teacher {cfg.teacher} has no goals; give one that reaches them")
     one_thread_without_gpu(device)
     torch.set_float32_matmul_precision("high")
     # The network is the same in all processes, what they draw is not.

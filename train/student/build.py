@@ -105,6 +105,8 @@ def _network(cfg: StudentTrainCfg, teacher: TrainedPolicy, device: str) -> Stude
     network = Student(cfg.student, teacher.num_actions, teacher.contract.num_tips).to(device)
     if cfg.init is not None:
         policy = open_student(str(cfg.init), device)
+        if policy.spec.network != cfg.student:
+            raise ValueError(f"--init {cfg.init} is of another size; leave out --student")
         if policy.hand == teacher.hand:
             network.load_state_dict(policy.network.state_dict())
         else:

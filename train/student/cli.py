@@ -20,12 +20,15 @@ errors."""
 
 
 def _as_in(base: StudentTrainCfg, init: str) -> StudentTrainCfg:
-    """``base`` with a student's sizes and camera."""
+    """``base`` with a student's sizes, and its camera if that looks at the same hand."""
+    from vd.policy.bundle import read_policy
     from vd.train.student.build import open_student
 
-    spec = open_student(init).spec
-    assert spec.camera is None or len(spec.camera) == 7
-    return replace(base, student=spec.network, camera=spec.camera)
+    policy = open_student(init)
+    hand = read_policy(find_policy(str(base.teacher))).hand
+    camera = policy.spec.camera if policy.hand == hand else base.camera
+    assert camera is None or len(camera) == 7
+    return replace(base, student=policy.spec.network, camera=camera)
 
 
 def _stage_before(base: StudentTrainCfg) -> str | None:
