@@ -12,10 +12,11 @@ from vd.assets_usd.objects.geometry import Surface
 from vd.sim.scene import Scene
 
 MANY_FACES = 4000
-"""A link with more triangles is drawn coarser: each costs time, and CAD files have many times more
-than pixels of 2 mm tell apart."""
+"""A link with more triangles is drawn coarser (ours): each costs time, and CAD files have many times
+more than pixels of 2 mm tell apart. Not tuned; LEAP's links have 9 000 to 87 000."""
 COARSE_DIGITS = 3
-"""Decimals of a metre in which vertices of such a link differ."""
+"""Decimals of a metre in which vertices of such a link differ (ours). Not tuned: with them an image of
+LEAP costs a CPU 8 ms, and 20 without."""
 
 
 class SurfaceSet:
