@@ -103,7 +103,7 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     )
     init = ["--stage", "1", "--init", str(folders[0] / "alignment.pt"), "--looks.steps", "2"]
     assert main(["alignment", *common, *init, "--out", str(folders[1]), "--max-steps", "32"]) == 0
-    assert "begins with" in capsys.readouterr().out
+    assert "begins from" in capsys.readouterr().out
     assert main(["alignment", "--out", str(folders[1]), "--resume", "--max-steps", "48"]) == 0
     assert "resumed after iteration 2" in capsys.readouterr().out
     rows = read_progress(folders[1] / "progress.jsonl")
