@@ -126,6 +126,7 @@ def _evaluated(settings: Path) -> dict[str, Any]:
     rows = [{key: row[key] for key in KEEP} for row in result["rows"]]
     for row in rows:
         row["consecutive"] = row["consecutive"][:1]
+        row["protocol"]["objects"] = Path(row["protocol"]["objects"]).name  # no machine's folder
     return {"seed": told["seed"], "policy": told["policy"]} | result["software"] | {"rows": rows}
 
 

@@ -57,6 +57,7 @@ def test_every_stored_figure_of_a_suite_has_its_command_line():
                 for line in entry.lines:
                     suite_run.settings(EvalCfg(), line, "zero", _any_objects(line)).validate()
         names = {entry["name"].split("/")[0] for entry in entries}
+        assert '"/' not in stored.read_text(), "a folder of the machine that measured"
         assert {key.split("/")[0] for key in json.loads(stored.read_text())} <= names
 
 

@@ -21,7 +21,7 @@ WATCHED = 30
 46 %, thirty 54, the whole episode 53; 49 since some are given up (LEAD)."""
 LEAD = 2.0
 """A belief that was doubted by so much more than another, in all steps together, is given up (ours):
-each look costs a robot 10 ms. Half and twice were not tried."""
+each look costs a robot 10 to 15 ms. Half and twice were not tried."""
 APART_RAD = 0.5
 """Beliefs that are less far from each other than this are one (ours). Not tuned."""
 
