@@ -95,6 +95,7 @@ def test_a_contact_sheet_says_all_there_is_to_say_and_within_its_edges(
 
 def test_the_name_of_a_procedural_set_makes_it():
     assert len(load_set("procedural-3-seed4")) == 3
+    assert [item.family for item in load_set("procedural-tools-2-seed4")] == ["bar", "handled"]
 
 
 def test_an_imported_cube_is_not_taken_for_the_built_in_one(

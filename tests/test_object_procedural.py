@@ -29,6 +29,11 @@ def held_out() -> list[ObjectModel]:
     return procedural.procedural_set(8, 0, families="heldout")
 
 
+@pytest.fixture(scope="module")
+def tools() -> list[ObjectModel]:
+    return procedural.procedural_set(18, 0, families="tools")
+
+
 def test_only_what_has_no_rotational_symmetry_is_for_training(training: list[ObjectModel]):
     """A symmetric solid is told by turning it, and none is drawn.
 
@@ -71,11 +76,19 @@ def test_equal_seeds_are_equal_and_others_differ(training: list[ObjectModel]):
         assert a.inertia.tolist() != c.inertia.tolist()
 
 
-def test_training_objects_are_round_and_slender(training: list[ObjectModel]):
-    sides = np.array([np.ptp(model.vertices, axis=0) for model in training])
-    aspects = sides.max(axis=1) / sides.min(axis=1)
-    assert aspects.min() < 2.0
-    assert aspects.max() > 5.0
+def aspects(models: Sequence[ObjectModel]) -> np.ndarray:
+    """Longest by shortest side of each."""
+    sides = np.array([np.ptp(model.vertices, axis=0) for model in models])
+    return sides.max(axis=1) / sides.min(axis=1)
+
+
+def test_training_objects_are_round_and_slender_and_tools_more_so(
+    training: list[ObjectModel], tools: list[ObjectModel]
+):
+    assert aspects(training).min() < 2.0
+    assert aspects(training).max() > 5.0
+    assert aspects(tools).max() > 6.0
+    assert np.median(aspects(tools)) > 1.2 * np.median(aspects(training))
 
 
 def is_connected(hulls: Sequence[Hull]) -> bool:
@@ -92,8 +105,10 @@ def is_connected(hulls: Sequence[Hull]) -> bool:
     return nx.is_connected(links)
 
 
-def test_every_object_is_valid(training: list[ObjectModel], held_out: list[ObjectModel]):
-    for model in training + held_out:
+def test_every_object_is_valid(
+    training: list[ObjectModel], held_out: list[ObjectModel], tools: list[ObjectModel]
+):
+    for model in training + held_out + tools:
         assert 1 < len(model.hulls) <= MAX_PARTS, model.name
         assert LONGEST_SIDE_M[0] - 1e-6 <= model.longest_side <= LONGEST_SIDE_M[1] + 1e-6, (
             model.name

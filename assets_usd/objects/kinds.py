@@ -140,6 +140,103 @@ def shell(u: Draw) -> Iterator[Hull]:
     yield box(tab, (u(0.4, 0.8), u(0.4, 0.9), 1.2 * wall))
 
 
+def _section(u: Draw, start: np.ndarray, end: np.ndarray, width: float, depth: float) -> Hull:
+    """A straight piece between two points: round, with corners, or flat as a blade is."""
+    match int(u.integers(3)):
+        case 0:
+            return rod(start, end, 0.5 * width, 0.5 * width * u(0.5, 1.0))
+        case 1:
+            return beam(start[[0, 2]], end[[0, 2]], width, depth)
+        case _:
+            return cylinder(start, end, 0.5 * width, 0.5 * width * u(0.6, 1.2), sides=8)
+
+
+def bar(u: Draw) -> Iterator[Hull]:
+    """Sections end to end in a line, and a knob beside it: pen, torch, screwdriver, knife."""
+    x = 0.0
+    for _ in range(int(u.integers(2, 5))):
+        width = u(0.3, 0.9)
+        start = vec(x - 0.1, 0, 0)
+        x += u(0.8, 2.4)
+        yield _section(u, start, vec(x, 0, u(-0.15, 0.15)), width, width * u(0.4, 1.2))
+    knob = vec(x * u(0.1, 0.9), 0, 0.3)
+    yield box(knob, u(0.25, 0.7, 3), euler=(0, 0, u(-0.5, 0.5)))
+
+
+def handled(u: Draw) -> Iterator[Hull]:
+    """A handle and a head across or along it: hammer, brush, spoon, racket, key."""
+    length = u(2.5, 5.0)
+    width = u(0.3, 0.7)
+    end = vec(length, 0, 0)
+    yield _section(u, vec(0, 0, 0), end, width, width * u(0.5, 1.2))
+    yield ellipsoid((0.2 * length, 0, 0), (u(0.2, 0.35) * length, 0.6 * width, 0.6 * width))
+    tilt = (u(-0.4, 0.4), u(-0.5, 0.5), u(-0.3, 0.3))
+    size = vec(u(0.4, 1.8), u(0.4, 2.4), u(0.25, 0.8))
+    if u.integers(2):
+        yield box(end, size, euler=tilt, top=(u(0.5, 1.0), u(0.5, 1.0)))
+    else:
+        yield ellipsoid(end, 0.6 * size, euler=tilt)
+    yield box(end + vec(u(-0.3, 0.2), 0.4 * size[1], u(0.0, 0.3)), u(0.3, 0.8, 3), euler=tilt)
+
+
+def prongs(u: Draw) -> Iterator[Hull]:
+    """A handle, a bridge across its end and bars along it: fork, rake, comb, plug, pliers."""
+    length = u(1.5, 3.5)
+    count = int(u.integers(2, 5))
+    reach = u(0.6, 2.2)
+    spread = u(0.9, 2.0)
+    width = u(0.25, 0.4)
+    rise = u(-0.3, 0.3)
+    yield _section(u, vec(0, 0, 0), vec(length, 0, 0), u(0.35, 0.7), u(0.3, 0.7))
+    yield box((length, 0, 0), (0.5, spread + width, u(0.3, 0.5)))
+    for y in np.linspace(-0.5, 0.5, count) * spread:
+        tip = vec(length + reach * u(0.7, 1.0), y * u(0.8, 1.2), rise)
+        yield rod((length, y, 0), tip, 0.5 * width)
+
+
+def cross(u: Draw) -> Iterator[Hull]:
+    """Two bars that cross, with a lump at their ends: scissors, clamp, wrench, propeller."""
+    angle = u(0.25, 1.4)
+    thick = u(0.3, 0.5)
+    for side in SIDES:
+        way = vec(np.cos(0.5 * angle), 0, side * np.sin(0.5 * angle))
+        front = u(1.0, 2.4)
+        back = u(0.6, 1.8)
+        shift = vec(0, 0.3 * side * thick, 0)
+        start = -back * way + shift
+        yield _section(u, start, front * way + shift, u(0.3, 0.6), thick)
+        yield _limb(u, start, -way)
+    yield cylinder((0, -0.6 * thick, 0), (0, 0.6 * thick, 0), u(0.25, 0.45), sides=10)
+
+
+def hoop(u: Draw) -> Iterator[Hull]:
+    """A bow of walls with pads at its ends: headphones, tongs, bracelet, handle of a bucket."""
+    span = u(2.4, 5.6)
+    radius = u(0.9, 1.3)
+    wall = u(0.2, 0.35)
+    height = u(0.25, 0.7)
+    angles = np.linspace(-0.5, 0.5, 6) * span
+    yield from _walls(radius, wall, angles, height, "y")
+    for end in (0, -1):
+        middle = (radius - 0.5 * wall) * vec(np.cos(angles[end]), 0, np.sin(angles[end]))
+        yield box(middle + vec(0, 0.5 * height, 0), u(0.4, 1.0, 3), euler=(0, -angles[end], 0))
+
+
+def frame(u: Draw) -> Iterator[Hull]:
+    """A flat front and two arms back from its ends: spectacles, clip, bracket, stapler, tray."""
+    width = u(1.6, 3.0)
+    tall = u(0.5, 1.0)
+    thick = u(0.25, 0.4)
+    reach = u(1.0, 2.6)
+    yield box((0, 0, 0), (thick, width, tall))
+    for side in SIDES:
+        root = vec(0, 0.5 * side * (width - thick), u(-0.3, 0.3) * tall)
+        tip = root + vec(-reach * u(0.7, 1.0), side * u(-0.5, 0.2), 0)
+        yield rod(root, tip, 0.5 * thick)
+        yield rod(tip, tip + vec(-0.3, 0, -u(0.2, 0.7)), 0.5 * thick)
+    yield box((0.1, u(-0.3, 0.3) * width, 0), (u(0.3, 0.8), u(0.4, 0.9), u(0.3, 0.8)))
+
+
 def mug(u: Draw) -> Iterator[Hull]:
     """A bottom, five walls, a handle of two rods: open, so truly concave."""
     radius = u(0.8, 1.0)
@@ -227,6 +324,7 @@ Kind = Callable[[Draw], Iterable[Hull]]
 KINDS: dict[str, tuple[Kind, ...]] = {
     "training": (figure, path, tool, plate, shell, cluster),
     "heldout": (mug, chair, robot, camera),
+    "tools": (bar, handled, prongs, cross, hoop, frame),
 }
 """Kinds by what a set of them is called; training draws none of the held-out ones. Their order is
-part of every object's seed."""
+part of every object's seed. Tools are as long and thin as hands can hold."""

@@ -181,7 +181,7 @@ def procedural_set(count: int, seed: int, *, families: str = "training") -> list
     Args:
         count: Number of objects.
         seed: Seed of the set. Object i depends on the families, the seed and i alone.
-        families: ``training`` or ``heldout`` (``KINDS``).
+        families: ``training``, ``tools`` or ``heldout`` (``KINDS``).
     """
     kinds = KINDS[families]
     word = list(KINDS).index(families)

@@ -21,9 +21,9 @@ HELD_OUT_COUNT = 30
 
 BUILT_IN = ("cube", "cuboid", "cylinder", "symmetric", "procedural-150-seed0", "procedural-heldout")
 """Sets named in help texts; ``procedural-<count>-seed<seed>`` and
-``procedural-heldout-<count>-seed<seed>`` take any numbers."""
+``procedural-heldout-<count>-seed<seed>`` and ``procedural-tools-...`` take any numbers."""
 
-_PROCEDURAL = re.compile(r"procedural-(?:(heldout)-)?([1-9]\d*)-seed(\d+)")
+_PROCEDURAL = re.compile(r"procedural-(?:(heldout|tools)-)?([1-9]\d*)-seed(\d+)")
 
 
 def objects_dir() -> Path:
@@ -127,7 +127,8 @@ def _place(entry: str | Path) -> Path:
         f"  built in, for --objects: {', '.join(BUILT_IN)}\n"
         f"  in {root}: {', '.join(imported) or 'none'}\n"
         f"  import meshes as a set: vd-assets import MESHES --out {named}\n"
-        "  of our own: procedural-150-seed0, procedural-heldout-30-seed0 and other numbers"
+        "  of our own: procedural-150-seed0, procedural-tools-150-seed0, procedural-heldout-30-seed0 "
+        "and other numbers"
     )
 
 
