@@ -123,9 +123,13 @@ def test_it_is_judged_by_its_turns_and_is_no_policy_with_goals(
     assert opened == [policy, "zero"], "each once"
     found = json.loads((tmp_path / SPIN_FILE).read_text())
     assert [row["object"] for row in found["rows"]] == ["cube", "cube"]
+    assert found["software"]["newton"]
     assert all(0.0 < row["held_s"] <= 0.5 and row["episodes"] == 2 for row in found["rows"])
     assert "revolutions" in capsys.readouterr().out
-    for more, why in (([policy, "--consecutive"], "no goals"), ([policy, "dclaw3"], "to goals")):
+    for more, why in (
+        ([policy, "--goals", "points", "--stop-tolerance", "0.1"], "--goals, --stop-tolerance"),
+        ([policy, "dclaw3"], "to goals"),
+    ):
         assert evaluate.main([*more, *flags, "--out", str(tmp_path)]) == 1
         assert why in capsys.readouterr().err
     assert train.main(["tracker", policy, "--objects", "cube", "--device", "cpu"]) == 1
@@ -134,7 +138,7 @@ def test_it_is_judged_by_its_turns_and_is_no_policy_with_goals(
 
 def test_what_hardly_turned_backwards_turned_nothing():
     row = Turns("zero", "cube", 2, -1e-4, 0.0, -1e-4, 0.5, 1.0)
-    assert "-" not in SpinResult((row,), (0.0, 0.0, 1.0), 30.0, "off", 0).text()
+    assert "-" not in SpinResult((row,), (0.0, 0.0, 1.0), 30.0, "off", 0, {}).text()
 
 
 def test_revolutions_are_about_the_axis_however_often_it_goes_round():
@@ -176,5 +180,5 @@ def test_the_cylinder_is_as_symmetric_as_it_says():
 
 def test_what_hardly_turned_has_turned_by_zero_without_a_sign():
     row = Turns("p", "cube", 4, -0.001, 0.0, per_drop=-0.01, dropped=0.25, held_s=1.0)
-    text = SpinResult((row,), (0.0, 0.0, 1.0), 1.0, "off", 0).text()
+    text = SpinResult((row,), (0.0, 0.0, 1.0), 1.0, "off", 0, {}).text()
     assert "0.00 (sd 0.00)" in text and "-0.0" not in text

@@ -64,10 +64,8 @@ def compare(
     policies = open_agents(cfg) if policies is None else policies
     for name, policy in policies.items():
         check_fits(name, policy, cfg.hand, cfg.hand_layer)
-    import warp as wp
-
     from vd.assets_usd.objects.sets import set_files
-    from vd.command.versions import MEASURING, SEEING, code_fingerprint, installed_versions
+    from vd.command.versions import MEASURING, SEEING
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
@@ -108,14 +106,23 @@ def compare(
             )
     assert env is not None, "there is a policy"
     env.close()
-    software = {
-        "device": wp.get_device(device).name,
-        "date": f"{date.today()}",
-        "code": code_fingerprint(SEEING if camera else MEASURING),
-    }
-    result = Result(tuple(rows), software | installed_versions(_PACKAGES))
+    result = Result(tuple(rows), software_of(device, SEEING if camera else MEASURING))
     result.write(cfg.out / "eval.json")
     return result
+
+
+def software_of(device: str, code: tuple[str, ...]) -> dict[str, str]:
+    """With what, where and when something is measured, by the packages ``code`` of ours."""
+    import warp as wp
+
+    from vd.command.versions import code_fingerprint, installed_versions
+
+    measured = {
+        "device": wp.get_device(device).name,
+        "date": f"{date.today()}",
+        "code": code_fingerprint(code),
+    }
+    return measured | installed_versions(_PACKAGES)
 
 
 def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) -> "ReorientCfg":

@@ -12,8 +12,9 @@ import warp as wp
 
 from vd.command.config import to_dict
 from vd.command.files import write_json
-from vd.evaluate.cfg import EvalCfg
-from vd.evaluate.compare import actor_of, device_of, envs_for, task_of
+from vd.command.versions import MEASURING
+from vd.evaluate.cfg import EvalCfg, flag
+from vd.evaluate.compare import actor_of, device_of, envs_for, software_of, task_of
 from vd.evaluate.page import NOTHING, aligned
 from vd.evaluate.trace import act_in, drawn_rounds
 from vd.policy.agents import check_fits
@@ -25,6 +26,16 @@ SPIN_S = 30.0
 """Length of an episode where none is asked for [s], that of HORA on the real hand."""
 SPIN_FILE = "spin.json"
 """What is written into ``--out``."""
+OF_GOALS = (
+    "in_air",
+    "air_goals",
+    "consecutive",
+    "plan",
+    "goals",
+    "stop_tolerance",
+    "max_goal_angle",
+)
+"""Settings that mean nothing where there is no goal."""
 _HEADER = ("policy", "object", "revolutions", "turned before a drop", "dropped", "held [s]")
 
 
@@ -59,6 +70,7 @@ class SpinResult:
     episode_s: float
     condition: str
     seed: int
+    software: dict[str, str]
     format: str = field(default="visual-dexterity spin 1")
 
     def text(self) -> str:
@@ -97,11 +109,11 @@ def evaluate_spin(cfg: EvalCfg, policies: Mapping[str, Any]) -> SpinResult:
     from vd.assets_usd.objects.sets import set_files
     from vd.envs.reorient import ReorientEnv
 
-    if cfg.consecutive or cfg.air_goals or cfg.in_air or cfg.plan:
-        raise ValueError(
-            "what spins has no goals and no table: leave out --consecutive, --air-goals, --in-air "
-            "and --plan"
-        )
+    ours = EvalCfg()
+    of_goals = [name for name in OF_GOALS if getattr(cfg, name) != getattr(ours, name)]
+    if of_goals:
+        flags = ", ".join(map(flag, of_goals))
+        raise ValueError(f"what spins has no goals and no table: leave out {flags}")
     device = device_of(cfg)
     with_goals = [name for name, policy in policies.items() if policy and not spins(policy)]
     if with_goals:
@@ -120,8 +132,14 @@ def evaluate_spin(cfg: EvalCfg, policies: Mapping[str, Any]) -> SpinResult:
         rows += _rows(name, env, *turn(env, actor, cfg.episodes))
         env.check()
         env.close()
-    spin = task.reward.spin
-    result = SpinResult(tuple(rows), spin.axis, task.episode_s, cfg.condition or "off", cfg.seed)
+    result = SpinResult(
+        tuple(rows),
+        axis=task.reward.spin.axis,
+        episode_s=task.episode_s,
+        condition=cfg.condition or "off",
+        seed=cfg.seed,
+        software=software_of(device, MEASURING),
+    )
     write_json(Path(cfg.out) / SPIN_FILE, to_dict(result))
     return result
 
