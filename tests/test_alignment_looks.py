@@ -16,17 +16,17 @@ from test_alignment import TINY
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.tracking import CameraActor, sensed
+from vd.evaluate.camera_actor import CameraActor, sensed
 from vd.policy.agents import SHIPPED_POLICIES, find_policy
 from vd.policy.bundle import read_policy
-from vd.policy.contract import TrackingSpec
-from vd.tracking.policy import TrackingPolicy
+from vd.policy.contract import VisionSpec
 from vd.train.alignment.config import LooksCfg
 from vd.train.alignment.looks import SimulatedLooks
 from vd.train.cli import main
 from vd.train.metrics import read_progress
 from vd.train.student.bank import mesh_points
 from vd.train.vec_env import ReorientVecEnv
+from vd.vision.acting_teacher import VisionPolicy
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.saved import load_alignment
 
@@ -47,8 +47,8 @@ def make_looks(points: int) -> SimulatedLooks:
     env = ReorientEnv(cfg, "cpu")
     network = AlignmentNetwork(TINY)
     teacher = read_policy(find_policy("dclaw3"))
-    contract = replace(teacher.contract, tracking=TrackingSpec(alignment=TINY))
-    policy = TrackingPolicy(teacher, contract, network)
+    contract = replace(teacher.contract, tracking=VisionSpec(alignment=TINY))
+    policy = VisionPolicy(teacher, contract, network)
     surfaces = mesh_points(env.objects, points, torch.device("cpu"))[..., :3]
     return SimulatedLooks(ReorientVecEnv(env), policy, surfaces, LooksCfg(steps=1, kept=6), seed=0)
 

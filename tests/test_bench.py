@@ -20,4 +20,4 @@ def test_sim_rows_add_up(tmp_path, capsys):
 
 def test_a_policy_that_cannot_be_measured_is_told_at_once():
     with pytest.raises(ValueError, match="sees point clouds"):
-        SimCommand(policy="dclaw3-tracking", device="cpu").run()
+        SimCommand(policy="dclaw3-vision", device="cpu").run()

@@ -30,7 +30,7 @@ LINES = {
     "vd-gap hide": "servo --out rec --effect backlash:width_rad=0.06 --effect dead_zone",
     "vd-bench sim": "--envs 16 32",
     "vd-assets import": "meshes --mcts-iterations 5",
-    "vd-deploy": "dclaw3-tracking --twin --safety.misses 12 --goal 0,0,0,1 --no-realtime",
+    "vd-deploy": "dclaw3-vision --twin --safety.misses 12 --goal 0,0,0,1 --no-realtime",
     "vd-policies pull": "dclaw3 --at folder",
 }
 REFUSED = {

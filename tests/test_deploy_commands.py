@@ -333,7 +333,7 @@ def test_nothing_but_the_fault_is_said_of_a_port_that_is_not_there():
 def test_a_misspelt_policy_is_told_those_that_are_there(capsys):
     assert cli.main(["dclaw44", "--twin"]) == 1
     said = capsys.readouterr().err
-    assert "no command 'dclaw44'" in said and "calibrate" in said and "dclaw4-tracking" in said
+    assert "no command 'dclaw44'" in said and "calibrate" in said and "dclaw4-vision" in said
 
 
 def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):

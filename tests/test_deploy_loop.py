@@ -501,11 +501,11 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
         return decide(runner, sensed)
 
     monkeypatch.setattr(CameraRunner, "decide", until_hot)
-    flags = ["dclaw4-tracking", "--hand", "dclaw4", "--twin", "--goal", "0,0,0.84147,0.5403"]
+    flags = ["dclaw4-vision", "--hand", "dclaw4", "--twin", "--goal", "0,0,0.84147,0.5403"]
     status, out, words = driven([*flags, *patient, "--log", str(folder)], capsys)
     assert status == 1 and "81 deg C" in words
     assert all(image.shape == (180, 320) and (image > 0.0).mean() > 0.5 for image in seen)
-    assert read_log(folder).run["kind"] == "tracking"
+    assert read_log(folder).run["kind"] == "vision"
     assert "goal 1: not reached" in out
     page = (folder / PAGE_FILE).read_text()
     assert "aborted" in page and (folder / FILM_FILE).stat().st_size > 1000
@@ -517,7 +517,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
     [
         ("--hand dclaw3 --port /dev/none dclaw3", "no robot senses. Tell it by --pose"),
         (
-            "--hand dclaw4 --twin dclaw3-tracking",
+            "--hand dclaw4 --twin dclaw3-vision",
             "was trained for dclaw3 (9 motors), not for dclaw4 (12)",
         ),
         ("--hand dclaw3 --port /dev/none", "/dev/none: there is no such device"),

@@ -98,7 +98,7 @@ def test_a_path_is_a_path_where_a_policy_is_called_the_same(own, tmp_path, monke
         vd.evaluate_policies(own, objects=("cube",))
 
 
-@pytest.mark.parametrize("policy", ["dclaw4", "dclaw4-tracking"])
+@pytest.mark.parametrize("policy", ["dclaw4", "dclaw4-vision"])
 def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, capsys, monkeypatch):
     from vd.envs import reorient
     from vd.play.cli import main as play

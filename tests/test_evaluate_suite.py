@@ -24,7 +24,7 @@ from vd.evaluate.trace import Episode
 from vd.paper import ResultConstants
 from vd.policy.agents import SHIPPED_POLICIES
 
-TEACHER, CAMERA = "dclaw3", "dclaw3-tracking"
+TEACHER, CAMERA = "dclaw3", "dclaw3-vision"
 OBJECTS = ("training=cube", "held-out=cube", "symmetric=cube")
 """Sets that need no authoring; the test double looks at none of them."""
 PAPERS, ROBUST = read_suite("paper").lines, read_suite("robust").lines

@@ -145,7 +145,7 @@ def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2)):
     """Rows of a camera policy whose predictions are too small."""
     objects = (FakeObject("a"), FakeObject("b", warnings=("open", "parts are off")))
     trace = traced(objects=objects, episodes=4, policy={"offset": offset}, fall_at=fall_at)
-    who = {"policy": "student.pt", "kind": "tracking", "sees": "complete clouds"}
+    who = {"policy": "student.pt", "kind": "student", "sees": "complete clouds"}
     return judged(trace, objects, **who, rules=rules)
 
 

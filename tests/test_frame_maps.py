@@ -42,11 +42,8 @@ def env(request):
 
 @pytest.fixture
 def maps(env):
-    def array(values, dtype):
-        return torch.tensor(values, dtype=getattr(torch, dtype))
-
     # Who is not asked.
-    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"), array)
+    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"), torch.device("cpu"))
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):

@@ -167,5 +167,5 @@ def test_the_tutorials_run_logs_its_terms_and_its_policy_knows_them(
         "run", episodes=1, episode_s=0.5, device="cpu", out=tmp_path / "eval"
     )
     assert result.rows[0].overall.episodes == 1
-    assert main(["tracker", "run", "--objects", "cube", "--out", "tracking.safetensors"]) == 1
+    assert main(["tracker", "run", "--objects", "cube", "--out", "vision.safetensors"]) == 1
     assert "own_terms:height" in capsys.readouterr().err

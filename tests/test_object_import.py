@@ -24,8 +24,8 @@ from vd.assets_usd.objects.model import read_object
 from vd.assets_usd.objects.plan import plan_jobs
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.settings import ImportSettings
+from vd.evaluate.symmetry import symmetries
 from vd.paper import PAPER
-from vd.tracking.symmetry import symmetries
 
 FAST = ImportSettings(threshold=0.05, mcts_iterations=20, time_limit=60.0)
 

@@ -87,7 +87,7 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
         f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()
     } <= sizes.keys()
     assert "vd/py.typed" in sizes and any(name.endswith("licenses/LICENSE") for name in sizes)
-    shipped = {DEFAULT_POLICY, f"{DEFAULT_POLICY}-tracking"}  # others are pulled
+    shipped = {DEFAULT_POLICY, f"{DEFAULT_POLICY}-vision"}  # others are pulled
     assert {name for name in sizes if name.endswith(".safetensors")} == {
         f"vd/policies/{name}.safetensors" for name in shipped
     }

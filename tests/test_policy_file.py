@@ -46,8 +46,8 @@ def path(tmp_path):
 
 
 def made(camera=None):
-    """The contract of a tracking policy that was made for a camera at this place."""
-    contract = read_contract(SHIPPED_POLICIES["dclaw3-tracking"])
+    """The contract of a vision policy that was made for a camera at this place."""
+    contract = read_contract(SHIPPED_POLICIES["dclaw3-vision"])
     tracking = replace(contract.tracking, camera=camera)
     task = replace(ReorientCfg(), **{name: contract.task[name] for name in ("hand", "fingertip")})
     interface = derive_interface(task, load_hand("dclaw3"), tracking)
@@ -65,7 +65,7 @@ def edit(path, change, weights=lambda _: None):
     path.write_bytes(sealed(save(tensors, {CONTRACT_KEY: json.dumps(values)})))
 
 
-@pytest.mark.parametrize("name", ["dclaw3", "dclaw3-tracking", "dclaw3-vision"])
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw3-vision"])
 def test_a_policy_that_is_exported_is_the_same_without_folders_of_its_machine(name, tmp_path):
     policy, out = open_policy(name, "cpu"), tmp_path / "out.safetensors"
     task = policy.contract.task | {"objects": ["/somewhere/mine/training-set", "cube"]}
@@ -208,7 +208,7 @@ def test_an_evaluation_refuses_a_hand_that_changed_under_its_name(tmp_path, caps
 def test_another_camera_is_refused_unless_the_policy_has_its_own(hand):
     place = hand.camera.position + np.array([0.0, 0.0, 0.02])
     moved = replace(hand, mounted_camera=replace(hand.camera, position=place))
-    assert made().interface == read_contract(SHIPPED_POLICIES["dclaw3-tracking"]).interface
+    assert made().interface == read_contract(SHIPPED_POLICIES["dclaw3-vision"]).interface
     with pytest.raises(ContractError, match=r"camera\.pose_in_base\[2\] is .*this one"):
         check_hand(made(), moved, "it")
     check_hand(made(PLACED), moved, "it")
@@ -237,7 +237,7 @@ def test_names_of_outputs_say_what_is_written(tmp_path, capsys, monkeypatch):
     for name in ("out.pt", "out", "out.onnx.bak"):
         assert train(["export", "dclaw4-cube", str(tmp_path / name)]) == 1
         assert ".safetensors or .onnx" in capsys.readouterr().err
-    tracker = ["tracker", "dclaw3", "--objects", "cube", "--out", str(tmp_path / "tracking.pt")]
+    tracker = ["tracker", "dclaw3", "--objects", "cube", "--out", str(tmp_path / "vision.pt")]
     assert train(tracker) == 1 and "in .safetensors" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
     written = []

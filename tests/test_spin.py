@@ -127,7 +127,7 @@ def test_it_is_judged_by_its_turns_and_is_no_policy_with_goals(
     assert all(0.0 < row["held_s"] <= 0.5 and row["episodes"] == 2 for row in found["rows"])
     assert "revolutions" in capsys.readouterr().out
     for more, why in (
-        ([policy, "--goals", "points", "--stop-tolerance", "0.1"], "--goals, --stop-tolerance"),
+        ([policy, "--goals", "scan", "--stop-tolerance", "0.1"], "--goals, --stop-tolerance"),
         ([policy, "dclaw3"], "to goals"),
     ):
         assert evaluate.main([*more, *flags, "--out", str(tmp_path)]) == 1

@@ -224,7 +224,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert cfg.env.observation.shape == "full" and cfg.ppo == PRESETS["gpu"]().ppo
     assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
     assert "--init: no policy" in capsys.readouterr().err
-    assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
+    assert main(["teacher", "--init", "dclaw3-vision", "--out", str(tmp_path / "run")]) == 1
     assert "teacher, dclaw3" in capsys.readouterr().err
     assert (
         main(["teacher", "--init-levels", "1", "0", "1", "1", "--out", str(tmp_path / "run")]) == 1

@@ -31,9 +31,10 @@ def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, n
         np.testing.assert_allclose(found, policy.act(observation).numpy(), atol=1e-4)
 
 
-def test_a_policy_that_sees_by_a_network_is_refused(tmp_path, capsys):
-    assert main(["export", "dclaw4-vision", str(tmp_path / "policy.onnx")]) == 1
-    assert "vision" in capsys.readouterr().err
+@pytest.mark.parametrize("kind", ["vision", "student"])
+def test_a_policy_that_sees_by_a_network_is_refused(tmp_path, capsys, kind):
+    assert main(["export", f"dclaw3-{kind}", str(tmp_path / "policy.onnx")]) == 1
+    assert f"a {kind} policy" in capsys.readouterr().err
     assert not (tmp_path / "policy.onnx").exists()
 
 
@@ -56,8 +57,8 @@ def test_a_file_with_other_actions_is_not_written(tmp_path, monkeypatch):
 
 
 def test_an_onnx_file_has_the_contract_of_its_policy_and_its_seal(tmp_path):
-    path, policy = tmp_path / "policy.onnx", open_policy("dclaw3-tracking", "cpu")
-    assert main(["export", "dclaw3-tracking", str(path)]) == 0
+    path, policy = tmp_path / "policy.onnx", open_policy("dclaw3", "cpu")
+    assert main(["export", "dclaw3", str(path)]) == 0
     assert read_onnx(path).contract == policy.contract
     whole = path.read_bytes()
     for place in np.linspace(0, len(whole) - 1, 40).astype(int):

@@ -67,7 +67,7 @@ TAKEN = {
     "vd-train alignment --stage 1": "--stage 1 --teacher dclaw4-cube --init dclaw4-vision",
     "vd-train adapt": "adapt dclaw3 --hand-layer gap/identified.usda --objects cube --num-envs 256",
     "vd-train adapt --steps 900 --seed 3": "--steps 900 --max-minutes 7.0 --seed 3",
-    "vd-train tracker --seed 3": "-seed0 --seed 3 --episodes 64 --out tracking.safetensors",
+    "vd-train tracker --seed 3": "-seed0 --seed 3 --episodes 64 --out vision.safetensors",
     "vd-deploy --twin": "dclaw3-vision --hand dclaw3 --object cube --twin   (3 goals)",
     "vd-deploy --hand dclaw3": "dclaw3-vision --hand dclaw3 --object cube --port {}/ttyUSB0",
     "vd-deploy --hand dclaw4": "dclaw4-vision --hand dclaw4 --object cube --port {}/ttyUSB0",
@@ -187,9 +187,9 @@ def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, mon
     assert "import URDF --describe leap" in typed("vd-deploy --hand leap --twin")[1]
     status, said = typed("vd-train adapt")
     assert status == 1 and "no gap/identified.usda" in said
-    assert default_policy("leap", "vision", "tracking", "teacher") == "leap-cube"
+    assert default_policy("leap", "vision", "teacher") == "leap-cube"
     with pytest.raises(ValueError, match=r"leap .*leap-objects"):
-        default_policy("leap", "vision", "tracking")
+        default_policy("leap", "vision")
 
 
 def test_a_hand_of_teachers_alone_names_them(typed, leap, tmp_path):

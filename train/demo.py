@@ -160,8 +160,8 @@ class Demo:
             Part("training", "A small training", self.training, cfg.out),
         ]
         self.parts = parts[:1] if cfg.quick else parts
-        self.policy = default_policy(HAND, "vision", "tracking")
-        """Installed policy that sees by camera, the vision policy if it is here."""
+        self.policy = default_policy(HAND, "vision")
+        """Installed policy that sees by camera."""
         self.objects: tuple[str, ...] = (HELD_OUT.format(SHOWN),)
         """Sets of the first part; the twin has the first object."""
 
@@ -225,7 +225,6 @@ class Demo:
             lines.append((summary.name, summary.episodes, success, symmetric, dropped))
         return {
             "policy": self.policy,
-            "sees": "vision" if self.policy.endswith("vision") else "tracking",
             "meshes": None if self.objects[0] == HELD_OUT.format(SHOWN) else self.cfg.meshes,
             "built_in": len(self.objects) > 1,
             "film": film,

@@ -74,29 +74,29 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
     """Write a policy's layers with its contract, and compare them with onnxruntime if it is there.
 
     They take ``observation`` [N, O], which they normalise, to the mean ``action`` [N, D] of any
-    number N of environments. Of a tracking policy they are its teacher's.
+    number N of environments.
 
     Raises:
         ModuleNotFoundError: What the export needs is not installed.
         RuntimeError: Outputs differ by more than rounding.
-        ValueError: It sees by a network, which is not exported.
+        ValueError: It sees by a camera, of which nothing is exported.
     """
     import torch
 
     from vd.policy.actor import TrainedPolicy
     from vd.policy.contract import SEAL_KEY, UNSEALED, sealed
     from vd.policy.onnx import onnx_metadata
-    from vd.vision.acting import StudentPolicy
 
-    if isinstance(policy, StudentPolicy) or policy.kind == "vision":
-        raise ValueError(f"{path}: what a {policy.kind} policy sees by is not exported to ONNX")
+    if not isinstance(policy, TrainedPolicy):
+        raise ValueError(
+            f"{path}: what a {policy.kind} policy sees by is not exported to ONNX; give its teacher"
+        )
     interrupt.need("onnx", "onnxscript")
     import onnx
 
-    teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
-    network = teacher.network.eval().requires_grad_(False)
+    network = policy.network.eval().requires_grad_(False)
     rng = torch.Generator().manual_seed(0)
-    observation = torch.randn(CHECKED, teacher.num_observations, generator=rng)
+    observation = torch.randn(CHECKED, policy.num_observations, generator=rng)
     # It warns of libraries that this network does not need, and of its own future.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), atomic_path(path) as temporary:

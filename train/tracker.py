@@ -17,25 +17,21 @@ from vd.command.device import resolve_device
 from vd.command.files import check_file
 from vd.command.line import flags_of, parse, say_same_as
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
-from vd.evaluate.goals import Goals
 from vd.paper import PAPER
 from vd.policy import SUFFIX, check_suffix
-from vd.policy.agents import DEFAULT_POLICY, check_names
+from vd.policy.agents import DEFAULT_POLICY, check_names, default_policy
 
 if TYPE_CHECKING:
+    from vd.evaluate.camera_actor import AnyCameraPolicy
     from vd.evaluate.trace import Trace
-    from vd.evaluate.tracking import AnyCameraPolicy
     from vd.policy.contract import Contract
 
 
 @dataclass(kw_only=True)
 class TrackerCfg(EpisodeFlags):
-    """Write a tracking policy: a teacher that acts by a depth camera, on objects of known shape.
+    """Write a vision policy: a teacher that acts by a depth camera.
 
-    With --alignment it is a vision policy: of the shape it knows no more than the points of the
-    goal.
-
-    It finds the object among the camera's points. Nothing is learned; its stopping rules, for
+    A network finds the object by its goal's points. Nothing is learned; its stopping rules, for
     --stop-tolerance and for 0.1 rad, are chosen on episodes with objects of validation, those of
     vd-eval with the same flags.
     """
@@ -48,8 +44,9 @@ class TrackerCfg(EpisodeFlags):
     procedural-heldout, and a few of its kinds on a CPU."""
     alignment: str | None = None
     """Network that finds objects by their goals' points: the alignment.pt of vd-train alignment, or
-    a vision policy, for that of it: its name or file."""
-    out: Path = Path("tracking.safetensors")
+    a vision policy, for that of it: its name or file. By default the hand's installed vision
+    policy."""
+    out: Path = Path("vision.safetensors")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
@@ -58,7 +55,6 @@ class TrackerCfg(EpisodeFlags):
     """Episodes; rounded up to as many of each object. 256 by default, 64 on a CPU."""
     smoke: bool = False
     """Check the installation: two episodes with a cube, on the CPU. Nothing is kept."""
-    goals: Goals = "points"
     seed: int = 1000
 
 
@@ -146,14 +142,14 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
     """The student that is named, or the teacher, let act by a camera.
 
     Raises:
-        ValueError: It is neither, or observes what no camera shows.
+        ValueError: It is neither, or observes what no camera shows, or no network is there.
     """
     from vd.evaluate.spin import spins
     from vd.policy.agents import open_policy, open_teacher, policy_name
-    from vd.policy.contract import TrackingSpec
-    from vd.tracking.policy import TrackingPolicy
+    from vd.policy.contract import VisionSpec
     from vd.train.alignment.network import open_network
     from vd.vision.acting import StudentPolicy
+    from vd.vision.acting_teacher import VisionPolicy
 
     student = open_policy(cfg.teacher, device)
     if isinstance(student, StudentPolicy):
@@ -172,12 +168,18 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
         raise ValueError(
             f"{cfg.teacher} observes {', '.join(terms)}, which no camera shows; give another"
         )
-    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
-    network = None
-    if cfg.alignment is not None:
-        network, camera = open_network(cfg.alignment, device)
-        spec = replace(spec, camera=cfg.camera or camera, alignment=network.cfg)
-    return TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
+    alignment = cfg.alignment
+    if alignment is None:
+        try:
+            alignment = default_policy(teacher.hand, "vision")
+        except ValueError as error:
+            raise ValueError(f"--alignment names what finds the object: {error}") from error
+        print(f"--alignment {alignment}: the network of the hand's installed vision policy")
+    network, camera = open_network(alignment, device)
+    spec = VisionSpec(
+        teacher=policy_name(cfg.teacher), camera=cfg.camera or camera, alignment=network.cfg
+    )
+    return VisionPolicy(teacher, replace(teacher.contract, tracking=spec), network)
 
 
 def _contract(policy: "AnyCameraPolicy", spec: Any) -> "Contract":
@@ -198,7 +200,7 @@ def _episodes(cfg: TrackerCfg, policy: "AnyCameraPolicy", device: str) -> "Trace
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.compare import actor_of, envs_for, run_episodes, task_of
-    from vd.tracking.symmetry import with_symmetries
+    from vd.evaluate.symmetry import with_symmetries
 
     count = len(load_set(list(cfg.objects)))
     assert cfg.episodes is not None
@@ -220,7 +222,7 @@ def _episodes(cfg: TrackerCfg, policy: "AnyCameraPolicy", device: str) -> "Trace
 def _conditions(cfg: TrackerCfg, episodes: int) -> str:
     """On what rules were found."""
     parts = [f"{', '.join(Path(item).name for item in cfg.objects)}: {episodes} episodes"]
-    parts += [] if cfg.goals == "mesh" else [f"goals by {cfg.goals}"]
+    parts += [f"goals by {cfg.goals}"]
     parts += ["in the air"] if cfg.in_air else []
     parts += [] if cfg.sensor_errors else ["without sensor errors"]
     return ", ".join([*parts, f"tolerance {cfg.stop_tolerance:g} rad", f"seed {cfg.seed}"])

@@ -100,7 +100,7 @@ def observation_layout(cfg: "ReorientCfg") -> dict[str, slice]:
 
 
 class ObjectTracker:
-    """Finds an object of known shape in depth images beside the hand.
+    """Finds an object in depth images beside the hand, by points of its surface.
 
     :meth:`look` takes the next.
     """
@@ -111,36 +111,46 @@ class ObjectTracker:
         item: "ObjectModel",
         camera: "CameraModel | None" = None,
         *,
+        policy: str | Path | None = None,
         device: str = "cpu",
     ):
-        """Measure the shape.
+        """Load the network.
 
         Args:
             hand: The hand (:func:`load_hand`), whose own points are left out.
-            item: The object (:func:`load_objects`).
-            camera: Lens, and pose in the base frame; the hand's own by default (``hand.camera``).
+            item: The object (:func:`load_objects`), of which the surface points are known.
+            camera: Lens, and pose in the base frame; the policy's by default.
+            policy: A vision policy, whose network finds the object; the hand's installed one by
+                default.
             device: auto, cpu or cuda:N.
+
+        Raises:
+            FileNotFoundError: There is no such policy.
+            ValueError: It is no vision policy, or none of this hand is installed.
         """
         import torch
 
         from vd.command.device import resolve_device
         from vd.kernels.task.observations import teacher_observation_size
         from vd.paper import PAPER
+        from vd.policy.agents import default_policy, open_policy
         from vd.sensors.depth_cloud import CameraCloud
-        from vd.tracking.camera_observer import CameraObserver
+        from vd.vision.acting_teacher import VisionPolicy
+        from vd.vision.camera_observer import CameraObserver
 
-        camera, device = camera or hand.camera, resolve_device(device)
+        device = resolve_device(device)
+        name = policy or default_policy(hand.name, "vision")
+        seeing = open_policy(name, device)
+        if not isinstance(seeing, VisionPolicy):
+            raise ValueError(f"{name} finds nothing by points; name a vision policy")
+        camera = camera or hand.camera.at(seeing.spec.camera)
         self._cloud = CameraCloud(camera, np.asarray(hand.mount), device=device)
         self._observer = CameraObserver(
             hand,
-            [item],
-            teacher_observation_size(hand.num_fingers, hand.num_joints),
-            world_object=np.zeros(1, int),
-            world_scale=np.ones(1),
-            camera=camera,
+            seeing.alignment,
+            torch.tensor(item.surface_points[None], dtype=torch.float32, device=device),
+            num_observations=teacher_observation_size(hand.num_fingers, hand.num_joints),
             control_hz=PAPER.scene.control_hz,
-            device=device,
-            library=torch,
         )
 
     def look(self, depth: np.ndarray, joint_q: np.ndarray, *, fresh: bool = False) -> np.ndarray:

@@ -11,7 +11,7 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.statistics import symmetric_error
-from vd.geometry.arrays import Array, as_warp, library_of, of_warp
+from vd.geometry.arrays import as_warp, library_of, of_warp
 from vd.paper import PAPER
 from vd.policy import ONNX_SUFFIX, has_suffix
 from vd.policy.agents import check_fits, open_policy, task_for
@@ -19,11 +19,10 @@ from vd.policy.onnx import read_onnx
 from vd.policy.senses import Senses
 from vd.policy.stopping import StoppingRule
 from vd.sensors.depth_cloud import CameraCloud
-from vd.tracking.policy import TrackingPolicy
-from vd.tracking.tracker import Tracker
 
 if TYPE_CHECKING:
     from vd.vision.acting import StudentPolicy
+    from vd.vision.acting_teacher import VisionPolicy
 
 SPIN_S = 30.0
 """For how long an object is turned where nothing is asked for [s], as by HORA."""
@@ -83,7 +82,7 @@ class PolicyRunner:
         rule: When it has arrived.
 
     Attributes:
-        kind: tracking, vision, student, teacher, joints or zero.
+        kind: vision, student, teacher, joints or zero.
         camera: Where its depth camera has to be; None: it has none.
         calibrated: Whether its rule to stop comes from episodes.
         spin_axis: Axis about which it turns an object without a goal, in the world; None: it has
@@ -216,7 +215,7 @@ class JointPolicyRunner(TeacherPolicyRunner):
 
 
 class CameraRunner(PolicyRunner):
-    """A policy that sees by a camera: tracking, vision or student.
+    """A policy that sees by a camera: vision or student.
 
     Arguments are those of :func:`load_runner`.
 
@@ -229,7 +228,7 @@ class CameraRunner(PolicyRunner):
 
     def __init__(
         self,
-        policy: "TrackingPolicy | StudentPolicy",
+        policy: "VisionPolicy | StudentPolicy",
         hand: HandModel,
         item: ObjectModel,
         *,
@@ -239,35 +238,32 @@ class CameraRunner(PolicyRunner):
         super().__init__(ReorientCfg.of(policy), policy.spec.rule_for(tolerance_rad))
         self.kind = policy.kind
         self.calibrated = policy.spec.calibrated_for(tolerance_rad)
-        self._policy = policy
-        self._hand = hand
-        self._item = item
+        self._depth = policy.spec.depth
+        self._mount = hand.mount
         self._seed = seed
         self._fresh = True
         self.look_by(hand.camera.at(policy.spec.camera))
+        import torch
+
+        from vd.vision.acting import ActingStudent, StudentPolicy
+        from vd.vision.acting_teacher import ActingTeacher
+
+        goals = torch.tensor(item.surface_points, dtype=torch.float32)[None]
+        if isinstance(policy, StudentPolicy):
+            self._tracker: Any = ActingStudent(policy.network, hand, goals)
+        else:
+            self._tracker = ActingTeacher(policy, hand, goals)
 
     def look_by(self, camera: CameraModel) -> None:
         """See by another camera."""
-        depth = self._policy.spec.depth
         self.camera = camera
         self.eye = CameraCloud(
             camera,
-            mount=self._hand.mount,
-            points=depth.points,
-            crop_m=depth.crop_m,
+            mount=self._mount,
+            points=self._depth.points,
+            crop_m=self._depth.crop_m,
             seed=self._seed,
         )
-        if isinstance(self._policy, TrackingPolicy):
-            self._tracker: Any = Tracker(self._policy, self._hand, [self._item], camera)
-            self._library: Any = library_of(self._policy.teacher.network.offset)
-            return
-        import torch
-
-        from vd.vision.acting import ActingStudent
-
-        goal = torch.tensor(self._item.surface_points, dtype=torch.float32)
-        self._tracker = ActingStudent(self._policy.network, self._hand, goal[None])
-        self._library = torch
 
     def begin(self) -> None:
         """The object is looked for anew, which takes several times as long as a step."""
@@ -277,18 +273,18 @@ class CameraRunner(PolicyRunner):
         """Mean action, and the expected distance."""
         if sensed.depth is None:
             raise ValueError("the policy sees by a depth camera, but there is no image")
-        xp = self._library
+        import torch
 
-        def row(values: np.ndarray) -> Array:
-            return xp.asarray(values, dtype=xp.float32, copy=True)[None]
+        def row(values: np.ndarray) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.float32)[None]
 
         senses = Senses(
             joint_q=row(sensed.joint_q),
             joint_qd=row(sensed.joint_qd),
             action=row(sensed.smoothed),
             goal_quat=row(sensed.goal_quat),
-            points=of_warp(self.eye.seen(sensed.depth), xp),
-            fresh=xp.asarray([self._fresh]),
+            points=wp.to_torch(self.eye.seen(sensed.depth)),
+            fresh=torch.tensor([self._fresh]),
         )
         decided = self._tracker.step(senses)
         self._fresh = False
@@ -341,5 +337,5 @@ def load_runner(
         return TeacherPolicyRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
         f"{name} is a teacher: it needs the object's pose, which no robot senses. Tell it by "
-        "--pose, or have vd-train tracker make a tracking policy of it"
+        "--pose, or have vd-train tracker make a vision policy of it"
     )

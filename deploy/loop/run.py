@@ -74,7 +74,7 @@ class DriveCfg(HandOptions):
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
     """File or name of a policy that sees by camera or senses its joints alone, with --twin or --pose
-    a teacher too, by default the hand's installed vision or tracking policy. "zero" is the
+    a teacher too, by default the hand's installed vision policy. "zero" is the
     zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
@@ -133,9 +133,9 @@ class DriveCfg(HandOptions):
     @property
     def policy_name(self) -> str:
         """The policy, or the installed one of the hand; one that sees, on a twin a teacher too."""
-        kinds: tuple[str, ...] = ("vision", "tracking")
+        kinds: tuple[str, ...] = ("vision",)
         if self.twin:
-            kinds = ("vision", "tracking", "teacher")
+            kinds = ("vision", "teacher")
         if self.pose is not None:
             kinds = ("teacher",)
         return self.policy or default_policy(self.hand, *kinds)

@@ -1,7 +1,6 @@
-"""Shapes as grids of distances to their surfaces, so that a point costs one look-up whatever the shape is.
+"""Distances from shapes, as grids of which a point costs one look-up, and turns of a shape onto itself.
 
-Frames: *object* is that of the samples. Metres. N worlds, O shapes of S samples, grids of E^3
-distances.
+Frames: that of the object. Metres. O shapes, grids of E^3 distances, R rotations.
 """
 
 import warp as wp
@@ -10,17 +9,18 @@ wp.set_module_options({"enable_backward": False})
 
 ANYWHERE = wp.constant(1.0)
 """Farthest that the surface is looked for [m]."""
-
-
-@wp.struct
-class Shapes:
-    """Shapes that can be looked for, and which one each world holds."""
-
-    samples: wp.array2d[wp.vec3]  # [O, S] surface samples in the object frame, unscaled [m]
-    distance: wp.array4d[float]  # [O, E, E, E] distance to the surface on grids, < 0 inside [m]
-    half: wp.array[float]  # [O] half the side of each grid [m]
-    world_shape: wp.array[int]  # [N] shape of each world
-    world_scale: wp.array[float]  # [N] factor on its size
+LEVER_M = wp.constant(0.03)
+"""Turns weigh against shifts as at this distance from the centre, about the size of an object."""
+DAMPING = wp.constant(0.01)
+"""Curvature added to each direction, of one: what the points do not fix stays where it is."""
+LARGEST_TURN = wp.constant(0.5)
+"""Largest turn of one step [rad]."""
+SETTLED_M = wp.constant(5.0e-5)
+"""A step that shifts a pose by less than this [m] (ours, far below what is seen) ..."""
+SETTLED_RAD = wp.constant(1.0e-3)
+"""... and turns it by less than this [rad] is the last one (ours)."""
+SMALL = wp.constant(1.0e-7)
+"""Lengths and angles below this have no direction."""
 
 
 @wp.kernel
@@ -43,39 +43,29 @@ def off_mesh_kernel(
 @wp.kernel
 def shape_distance_kernel(
     # Model:
-    samples: wp.array2d[wp.vec3],  # [O, S] surface samples in the object frame [m]
     mesh: wp.array[wp.uint64],  # [O] mesh of each shape, with winding numbers
     half: wp.array[float],  # [O] half the side of each grid [m]
-    # In:
-    meshed_in: wp.array[int],  # [O] 1 where the surface is the mesh, 0 where it is the samples
     # Out:
-    distance_out: wp.array4d[float],  # [O, E, E, E] distances [m], negative inside of a mesh
+    distance_out: wp.array4d[float],  # [O, E, E, E] distances [m], negative inside
 ):
-    """Distance from each point of a grid to the surface. Launch: [O, E, E, E]."""
+    """Distance from each point of a grid to the mesh. Launch: [O, E, E, E]."""
     shape, i, j, k = wp.tid()
     side = 2.0 * half[shape] / float(distance_out.shape[1] - 1)
     corner = wp.vec3(half[shape], half[shape], half[shape])
     place = side * wp.vec3(float(i), float(j), float(k)) - corner
-    if meshed_in[shape] != 0:
-        found = wp.mesh_query_point_sign_winding_number(mesh[shape], place, ANYWHERE)
-        nearest = wp.mesh_eval_position(mesh[shape], found.face, found.u, found.v)
-        distance_out[shape, i, j, k] = found.sign * wp.length(nearest - place)
-        return
-    least = wp.length_sq(samples[shape, 0] - place)
-    for sample in range(1, samples.shape[1]):
-        least = wp.min(least, wp.length_sq(samples[shape, sample] - place))
-    distance_out[shape, i, j, k] = wp.sqrt(least)
+    found = wp.mesh_query_point_sign_winding_number(mesh[shape], place, ANYWHERE)
+    nearest = wp.mesh_eval_position(mesh[shape], found.face, found.u, found.v)
+    distance_out[shape, i, j, k] = found.sign * wp.length(nearest - place)
 
 
 @wp.func
-def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
-    """Distance of a point of the object frame (unscaled) from the surface, as in the grid, and its gradient.
+def surface_distance(distances: wp.array4d[float], half: float, shape: int, place: wp.vec3):
+    """Distance of a point from the surface, as in the grid, and its gradient.
 
     Between grid points it is interpolated; outside of the grid it grows by the distance from the
     grid.
     """
-    last = shapes.distance.shape[1] - 1
-    half = shapes.half[shape]
+    last = distances.shape[1] - 1
     per_metre = float(last) / (2.0 * half)
     grid = (place + wp.vec3(half, half, half)) * per_metre
     top = float(last) - 1.0e-3
@@ -88,14 +78,14 @@ def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
     u = inside[0] - float(i)
     v = inside[1] - float(j)
     w = inside[2] - float(k)
-    d000 = shapes.distance[shape, i, j, k]
-    d001 = shapes.distance[shape, i, j, k + 1]
-    d010 = shapes.distance[shape, i, j + 1, k]
-    d011 = shapes.distance[shape, i, j + 1, k + 1]
-    d100 = shapes.distance[shape, i + 1, j, k]
-    d101 = shapes.distance[shape, i + 1, j, k + 1]
-    d110 = shapes.distance[shape, i + 1, j + 1, k]
-    d111 = shapes.distance[shape, i + 1, j + 1, k + 1]
+    d000 = distances[shape, i, j, k]
+    d001 = distances[shape, i, j, k + 1]
+    d010 = distances[shape, i, j + 1, k]
+    d011 = distances[shape, i, j + 1, k + 1]
+    d100 = distances[shape, i + 1, j, k]
+    d101 = distances[shape, i + 1, j, k + 1]
+    d110 = distances[shape, i + 1, j + 1, k]
+    d111 = distances[shape, i + 1, j + 1, k + 1]
     low = wp.lerp(wp.lerp(d000, d001, w), wp.lerp(d010, d011, w), v)
     high = wp.lerp(wp.lerp(d100, d101, w), wp.lerp(d110, d111, w), v)
     along_x = high - low
@@ -109,3 +99,85 @@ def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
         distance += beyond
         gradient = outside / beyond
     return distance, gradient
+
+
+@wp.func
+def improved(
+    distances: wp.array4d[float],
+    half: float,
+    points: wp.array2d[wp.vec3],
+    far: float,
+    shape: int,
+    pose: wp.transform,
+) -> wp.transform:
+    """A pose after one step of Gauss and Newton on the distances of points from the shape."""
+    place = wp.transform_get_translation(pose)
+    turn = wp.transform_get_rotation(pose)
+    # Curvature of shifts, of turns, and between them; slopes of both.
+    shifts = wp.mat33()
+    turns = wp.mat33()
+    mixed = wp.mat33()
+    shift_slope = wp.vec3()
+    turn_slope = wp.vec3()
+    for i in range(points.shape[1]):
+        arm = points[shape, i] - place
+        distance, gradient = surface_distance(distances, half, shape, wp.quat_rotate_inv(turn, arm))
+        normal = wp.quat_rotate(turn, gradient)
+        moment = wp.cross(arm, normal) / LEVER_M
+        weight = far * far / (far * far + distance * distance)
+        shifts += weight * wp.outer(normal, normal)
+        turns += weight * wp.outer(moment, moment)
+        mixed += weight * wp.outer(normal, moment)
+        shift_slope += weight * distance * normal
+        turn_slope += weight * distance * moment
+    damping = DAMPING * float(points.shape[1]) * wp.identity(n=3, dtype=float)
+    solved = wp.inverse(shifts + damping)
+    # The shift that is best for each turn put in (Schur's complement).
+    left = turns + damping - wp.transpose(mixed) * solved * mixed
+    angle_axis = wp.inverse(left) * (turn_slope - wp.transpose(mixed) * solved * shift_slope)
+    shift = solved * (shift_slope - mixed * angle_axis)
+    angle_axis = angle_axis / LEVER_M
+    angle = wp.length(angle_axis)
+    if angle > SMALL:
+        step = wp.quat_from_axis_angle(angle_axis / angle, wp.min(angle, LARGEST_TURN))
+        turn = wp.normalize(step * turn)
+    return wp.transform(place + shift, turn)
+
+
+@wp.kernel
+def turn_onto_itself_kernel(
+    # Model:
+    distances: wp.array4d[float],  # [O, E, E, E] of ``shape_distance_kernel`` [m]
+    half: wp.array[float],  # [O] half the side of each grid [m]
+    points: wp.array2d[wp.vec3],  # [O, P] points of each surface [m]
+    far: float,  # length at which distances are cut off [m]; from about there on points count less
+    steps: int,  # steps at most
+    # In:
+    mean_in: wp.array[wp.vec3],  # [O] middle of each shape [m] ...
+    place_in: wp.array[wp.vec3],  # [O] ... and where it is at first [m]
+    turn_in: wp.array[wp.quat],  # [R] rotations to begin from
+    # Out:
+    turn_out: wp.array2d[wp.quat],  # [O, R] rotations that are better
+    misfit_out: wp.array2d[float],  # [O, R] mean square of the points' distances [m^2]
+):
+    """Turn shapes until their own points lie on them, and say how badly they do. Launch: [O, R]."""
+    shape, row = wp.tid()
+    begun = turn_in[row]
+    pose = wp.transform(place_in[shape] - wp.quat_rotate(begun, mean_in[shape]), begun)
+    for _ in range(steps):
+        before = pose
+        pose = improved(distances, half[shape], points, far, shape, before)
+        shift = wp.transform_get_translation(pose) - wp.transform_get_translation(before)
+        # Half the angle, if small.
+        turn = wp.transform_get_rotation(pose) - wp.transform_get_rotation(before)
+        if wp.length(shift) < SETTLED_M and 2.0 * wp.length(turn) < SETTLED_RAD:
+            break
+    back = wp.transform_inverse(pose)
+    off = wp.float32(0.0)
+    for i in range(points.shape[1]):
+        place = wp.transform_point(back, points[shape, i])
+        distance, _gradient = surface_distance(distances, half[shape], shape, place)
+        distance = wp.min(wp.abs(distance), far)
+        off += distance * distance
+    turn_out[shape, row] = wp.transform_get_rotation(pose)
+    misfit_out[shape, row] = off / float(points.shape[1])

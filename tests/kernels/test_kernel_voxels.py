@@ -14,7 +14,7 @@ from vd.kernels.sensor.voxels import (
     coordinates_kernel,
     voxel_key_kernel,
 )
-from vd.tracking.object_points import object_points
+from vd.vision.object_points import object_points
 
 HALF = 2048
 NEAR = list(itertools.product((-1, 0, 1), repeat=3))

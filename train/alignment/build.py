@@ -11,8 +11,7 @@ from vd.command.config import to_dict
 from vd.envs.cfg import ObservationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.policy.actor import TrainedPolicy
-from vd.policy.contract import TrackingSpec
-from vd.tracking.policy import TrackingPolicy
+from vd.policy.contract import VisionSpec
 from vd.train.alignment.align import CLOUDS, AlignTrainer
 from vd.train.alignment.config import SIMULATED, AlignmentTrainCfg
 from vd.train.alignment.looks import SimulatedLooks
@@ -22,6 +21,7 @@ from vd.train.student.bank import ShapeBank, centred_points, mesh_points
 from vd.train.student.shapes import made_shapes
 from vd.train.student.views import Hands
 from vd.train.vec_env import ReorientVecEnv
+from vd.vision.acting_teacher import VisionPolicy
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.saved import AlignmentSpec
 
@@ -94,7 +94,7 @@ def _looks(
     env = ReorientVecEnv(simulation)
     # Or all episodes would time out at once.
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, env.max_episode_length)
-    spec = TrackingSpec(camera=cfg.camera, alignment=network.cfg)
-    policy = TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
+    spec = VisionSpec(camera=cfg.camera, alignment=network.cfg)
+    policy = VisionPolicy(teacher, replace(teacher.contract, tracking=spec), network)
     surfaces = mesh_points(simulation.objects, CLOUDS * cfg.align.points, network.summary.device)
     return SimulatedLooks(env, policy, surfaces[..., :3].contiguous(), cfg.looks, task.seed)

@@ -12,15 +12,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from vd.evaluate.tracking import CameraActor
+from vd.evaluate.camera_actor import CameraActor
 from vd.geometry.quaternions import poses_in, rotation_distance
-from vd.tracking.policy import TrackingPolicy
-from vd.tracking.tracker import Tracker
 from vd.train.alignment.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+from vd.vision.acting_teacher import ActingTeacher, VisionPolicy
 from vd.vision.cfg import SEEN_POINTS
-from vd.vision.finder import GoalFinder
 from vd.vision.rotations import quaternion_matrices
 
 ENDS = ("task/reached", "task/dropped", "task/timed_out")
@@ -41,7 +39,7 @@ class SimulatedLooks:
     def __init__(
         self,
         env: ReorientVecEnv,
-        policy: TrackingPolicy,
+        policy: VisionPolicy,
         surfaces: Tensor,
         cfg: LooksCfg,
         seed: int,
@@ -52,7 +50,7 @@ class SimulatedLooks:
         device = surfaces.device
         simulation = env.env
         scene = simulation.scene
-        self._actor = CameraActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
+        self._actor = CameraActor(simulation, policy, sensor_errors=True, seed=seed)
         self._object_pose = wp.to_torch(simulation.sim.body_q)[:, scene.object_body]
         self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=device)
         self._object_of_env = torch.tensor(np.asarray(scene.world_object), device=device)
@@ -67,9 +65,8 @@ class SimulatedLooks:
         """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
         logs = []
         errors = []
-        assert isinstance(self._actor.tracker, Tracker)
+        assert isinstance(self._actor.tracker, ActingTeacher)
         finder = self._actor.tracker.observer.finder
-        assert isinstance(finder, GoalFinder)  # the policy has a network
         observation = self._env.get_observations()[OBSERVATION_GROUP]
         for _ in range(self.cfg.steps):
             if stopping():
@@ -78,7 +75,7 @@ class SimulatedLooks:
             pose = poses_in(self._base, self._object_pose)
             rows = finder.seen_now.nonzero().flatten()
             self._keep(finder.seen[rows], pose[rows], rows)
-            errors.append(rotation_distance(finder.pose[rows, 0, 3:], pose[rows, 3:]))
+            errors.append(rotation_distance(finder.pose[rows, 3:], pose[rows, 3:]))
             _, _, _, extras = self._env.step(action)
             logs.append(torch.stack([extras["log"][name] for name in ENDS]))
         self._env.env.check()

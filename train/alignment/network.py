@@ -22,13 +22,13 @@ def open_network(
         ValueError: It holds no such network.
     """
     from vd.policy.agents import installed_policies, open_policy
-    from vd.tracking.policy import TrackingPolicy
+    from vd.vision.acting_teacher import VisionPolicy
 
     if name not in installed_policies() and not has_suffix(name, SUFFIX):
         network, learned = load_alignment(name, device)
         return network, learned.camera
     policy = open_policy(name, device)
-    if not isinstance(policy, TrackingPolicy) or policy.alignment is None:
+    if not isinstance(policy, VisionPolicy):
         raise ValueError(f"{name} finds nothing by its goal's points; name a vision policy")
     return policy.alignment, policy.spec.camera
 

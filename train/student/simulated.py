@@ -17,7 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from vd.evaluate.tracking import sensed, sensed_with
+from vd.evaluate.camera_actor import sensed, sensed_with
 from vd.geometry.quaternions import poses_in
 from vd.policy.actor import TrainedPolicy
 from vd.policy.senses import Senses

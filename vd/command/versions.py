@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-MEASURING = ("kernels", "geometry", "assets_usd", "sim", "envs", "tracking", "policy", "evaluate")
+MEASURING = ("kernels", "geometry", "assets_usd", "sim", "envs", "policy", "evaluate")
 """Packages that decide what an evaluation gives."""
 SEEING = (*MEASURING, "sensors", "vision")
 """The same of policies that see by a camera."""

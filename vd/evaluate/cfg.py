@@ -75,10 +75,9 @@ class EpisodeFlags(TaskFlags):
     episode_s: float | None = None
     """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals of
     vd-eval, of whose --consecutive it is the time for each goal."""
-    goals: Goals = "mesh"
-    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the
-    paper's; or a scan, points with 4 mm of noise and a fifth missing. A surface is laid through
-    points.
+    goals: Goals = "points"
+    """What camera policies know shapes and goals by: 500 exact points, as the paper's; or a scan,
+    points with 4 mm of noise and a fifth missing.
     """
     sensor_errors: bool = True
     """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is

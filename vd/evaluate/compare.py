@@ -68,7 +68,7 @@ def compare(
     from vd.command.versions import MEASURING, SEEING
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
-    from vd.tracking.symmetry import with_symmetries
+    from vd.evaluate.symmetry import with_symmetries
 
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(chain(*groups.values())))
@@ -188,7 +188,7 @@ def actor_of(
     policy: Any | None,
     env: "ReorientEnv",
     *,
-    goals: "Goals" = "mesh",
+    goals: "Goals" = "points",
     sensor_errors: bool = False,
     seed: int = 0,
 ) -> tuple[Any, "Agent"]:
@@ -209,7 +209,7 @@ def actor_of(
     if not sees_clouds(policy):
         return policy, Agent(name, "teacher", "state", StoppingRule)
     from vd.command.workers import one_thread_without_gpu
-    from vd.evaluate.tracking import CameraActor
+    from vd.evaluate.camera_actor import CameraActor
 
     one_thread_without_gpu(env.device)
     eyes = CameraActor(env, policy, goals=goals, sensor_errors=sensor_errors, seed=seed)

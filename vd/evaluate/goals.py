@@ -5,10 +5,8 @@ from typing import Literal
 
 from vd.paper import PAPER
 
-Goals = Literal["mesh", "points", "scan"]
-"""What a camera policy knows of a shape and its goal: the mesh, 500 exact points of it, or a
-scan's.
-"""
+Goals = Literal["points", "scan"]
+"""What a camera policy knows of a shape and its goal: 500 exact points of it, or a scan's."""
 HOLD_S = 2.0
 """For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""
 

@@ -81,7 +81,7 @@ class Protocol:
     """Goal after goal until one fails; ``episode_s`` is the time for each."""
     table_friction: float | None = None
     """Coefficient of the table if it is not the nominal one."""
-    goals: Goals = "mesh"
+    goals: Goals = "points"
     """What camera policies know shapes and goals by."""
     sensor_errors: bool = False
     """Cameras have the errors of a real one."""
@@ -169,7 +169,7 @@ class Row:
     policy: str
     """As it was named."""
     kind: str
-    """teacher, tracking, vision, function, zero, random."""
+    """teacher, vision, student, function, zero, random."""
     sees: str
     """state, rendered clouds or nothing."""
     group: str

@@ -4,18 +4,14 @@
 
 The paper's goals for household objects come from a tablet's scans, which are imperfect in ways it
 does not quantify (its Figure 5). Here a scan errs as much as a cloud in training may, but
-lastingly: the same points are wrong in every step. The surface behind them is laid as through those
-of a real scan (:mod:`vd.assets_usd.objects.scans`); the true shape is the simulation's alone.
+lastingly: the same points are wrong in every step. The true shape is the simulation's alone.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from vd.assets_usd.objects.geometry import surface_points
 from vd.assets_usd.objects.model import ObjectModel
-from vd.assets_usd.objects.scans import surface_of_scan
 from vd.evaluate.goals import Goals
 from vd.paper import PAPER
 
@@ -39,38 +35,10 @@ def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return scanned
 
 
-def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> ObjectModel:
-    """An object as points of it [m] [K, 3], body frame, tell.
-
-    The surface through them, and its samples.
-    """
-    surface = surface_of_scan(points, device)
-    samples = surface_points(surface, len(item.surface_points))
-    return replace(
-        item,
-        vertices=surface.vertices.astype(np.float32),
-        faces=surface.faces,
-        surface_points=samples.astype(np.float32),
-    )
-
-
-def known_objects(
-    objects: Sequence[ObjectModel], goals: Goals, *, seed: int, device: str, surfaces: bool = True
-) -> Sequence[ObjectModel]:
-    """Objects as a policy knows them: as they are, by their samples, or by a scan of these.
-
-    Without ``surfaces`` none is laid through the points: they are all that is known.
-    """
-    if goals == "mesh":
-        return objects
+def known_points(objects: Sequence[ObjectModel], goals: Goals, *, seed: int) -> np.ndarray:
+    """What a policy knows of objects: their samples, or a scan of these [m] [O, P, 3], body frame."""
     rng = np.random.default_rng(seed)
-    known = []
-    for item in objects:
-        points = item.surface_points
-        if goals == "scan":
-            points = scan(points, rng)
-        if surfaces:
-            known.append(known_by_points(item, points, device))
-        else:
-            known.append(replace(item, surface_points=points))
-    return known
+    known = [item.surface_points for item in objects]
+    if goals == "scan":
+        known = [scan(points, rng) for points in known]
+    return np.stack(known)

@@ -21,15 +21,6 @@ def library_of(array: Array) -> Any:
     return torch
 
 
-def library_on(device: str) -> Any:
-    """The module for work that needs neither by itself: numpy on a CPU, torch on a GPU."""
-    if wp.get_device(device).is_cpu:
-        return np
-    import torch
-
-    return torch
-
-
 def as_warp(array: Array, dtype: Any = None) -> wp.array:
     """The memory of an array for Warp, of ``dtype``, such as ``wp.vec3``.
 
@@ -44,10 +35,3 @@ def as_warp(array: Array, dtype: Any = None) -> wp.array:
 def of_warp(array: wp.array, library: Any) -> Array:
     """The memory of a Warp array for a library; vectors and the like are the last axis."""
     return array.numpy() if library is np else wp.to_torch(array)
-
-
-def take_along(values: Array, index: Array, axis: int) -> Array:
-    """Values at indices along an axis; the other axes are broadcast."""
-    if isinstance(values, np.ndarray):
-        return np.take_along_axis(values, index, axis)
-    return values.take_along_dim(index, dim=axis)

@@ -5,17 +5,17 @@ every step, from the rotation as it is known: a teacher acts as well so, and not
 remembered. N hands, O values of the observation, D actions. World frame: z up; quaternions xyzw.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ObservationCfg
 from vd.envs.symmetry_frames import symmetry_frames
-from vd.geometry.arrays import Array, library_of, take_along
 from vd.kernels.task.observations import teacher_observation_slices
 
 
@@ -25,41 +25,42 @@ class FrameMaps:
     Args:
         hand: The hand.
         observation: How its teacher observes.
-        array: Makes arrays of the library and device in which observations are given, of a dtype by
-            name.
+        device: Of the observations.
     """
 
-    def __init__(
-        self, hand: HandModel, observation: ObservationCfg, array: Callable[[Any, str], Array]
-    ) -> None:
+    def __init__(self, hand: HandModel, observation: ObservationCfg, device: torch.device) -> None:
         # What else a training observes, only simulators know.
         actor = replace(observation, dynamics="none", critic_terms={})
         tables = symmetry_frames(hand, actor, observation.view)
-        self._source = array(tables.source, "int64")
-        self._joints = array(tables.joints, "int64")
-        self._factor = array(tables.factor, "float32")
-        self._offset = array(tables.offset, "float32")
-        self._sign = array(tables.sign, "float32")
-        self._sector = array(tables.sector, "float32")
+
+        def tensor(values: Any, dtype: torch.dtype) -> Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        self._source = tensor(tables.source, torch.int64)
+        self._joints = tensor(tables.joints, torch.int64)
+        self._factor = tensor(tables.factor, torch.float32)
+        self._offset = tensor(tables.offset, torch.float32)
+        self._sign = tensor(tables.sign, torch.float32)
+        self._sector = tensor(tables.sector, torch.float32)
         self._turn = teacher_observation_slices(hand.num_fingers, hand.num_joints)[
             "relative_orientation"
         ]
 
-    def choose(self, observation: Array) -> Array:
+    def choose(self, observation: Tensor) -> Tensor:
         """Frames [N] of observations [N, O]: the axis of the wanted rotation is in their sector."""
         turn = observation[..., self._turn]
         # Observed is the object from the goal; wanted is the other way, by less than half a turn.
-        axis = library_of(turn).where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
-        return (axis @ self._sector.T).argmax(axis=-1)
+        axis = torch.where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
+        return (axis @ self._sector.T).argmax(dim=-1)
 
-    def take(self, observation: Array, frame: Array) -> Array:
+    def take(self, observation: Tensor, frame: Tensor) -> Tensor:
         """Observations [N, O] as frames [N] show them."""
-        values = take_along(observation[..., None], self._source[frame], axis=1)
-        return (self._factor[frame] * values).sum(axis=-1) + self._offset[frame]
+        values = observation[..., None].take_along_dim(self._source[frame], dim=1)
+        return (self._factor[frame] * values).sum(dim=-1) + self._offset[frame]
 
-    def world_action(self, action: Array, frame: Array) -> Array:
+    def world_action(self, action: Tensor, frame: Tensor) -> Tensor:
         """Actions [N, D] of frames [N] with the joints in the world's order."""
-        return self._sign[frame] * take_along(action, self._joints[frame], axis=1)
+        return self._sign[frame] * action.take_along_dim(self._joints[frame], dim=1)
 
 
 def turns_of_hand(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

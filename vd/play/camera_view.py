@@ -17,7 +17,7 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     Surface points are drawn in where the object is believed to be.
 
     Args:
-        actor: A :class:`vd.evaluate.tracking.CameraActor` that has acted.
+        actor: A :class:`vd.evaluate.camera_actor.CameraActor` that has acted.
         world: Environment.
 
     Returns:

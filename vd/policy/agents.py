@@ -77,7 +77,7 @@ def default_policy(hand: str, *kinds: str) -> str:
 
     Args:
         hand: Name or USD of the hand.
-        kinds: ``teacher``, ``tracking`` or ``vision``.
+        kinds: ``teacher``, ``vision`` or ``student``.
 
     Raises:
         ValueError: The hand has none.

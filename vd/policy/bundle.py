@@ -19,8 +19,8 @@ from vd.policy.contract import (
     read_sealed,
     sealed,
 )
-from vd.tracking.policy import TrackingPolicy
 from vd.vision.acting import StudentPolicy
+from vd.vision.acting_teacher import VisionPolicy
 from vd.vision.inputs import Belief, StudentInput
 from vd.vision.saved import alignment_network
 from vd.vision.student import Student
@@ -37,7 +37,7 @@ TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors and
 other versions of torch differ by 1e-6 to 1e-3."""
 
-AnyPolicy = TrainedPolicy | TrackingPolicy | StudentPolicy
+AnyPolicy = TrainedPolicy | VisionPolicy | StudentPolicy
 Tensors = dict[str, torch.Tensor]
 
 
@@ -123,10 +123,11 @@ def _weights(policy: AnyPolicy) -> dict[str, Tensors]:
         return {"student": policy.network.state_dict()}
     if isinstance(policy, TrainedPolicy):
         return {"actor": policy.weights, "critic": policy.critic}
-    parts = {"actor": policy.teacher.weights, "critic": policy.teacher.critic}
-    if policy.alignment is not None:
-        parts["alignment"] = policy.alignment.state_dict()
-    return parts
+    return {
+        "actor": policy.teacher.weights,
+        "critic": policy.teacher.critic,
+        "alignment": policy.alignment.state_dict(),
+    }
 
 
 def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
@@ -142,11 +143,9 @@ def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
     )
     if contract.tracking is None:
         return teacher
-    alignment = None
-    if contract.tracking.alignment is not None:
-        weights = _part(on_device, "alignment.")
-        alignment = alignment_network(contract.tracking.alignment, weights, device)
-    return TrackingPolicy(teacher, contract, alignment)
+    weights = _part(on_device, "alignment.")
+    alignment = alignment_network(contract.tracking.alignment, weights, device)
+    return VisionPolicy(teacher, contract, alignment)
 
 
 def _golden_inputs(policy: AnyPolicy) -> Tensors:
@@ -165,7 +164,7 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
         drawn["proprioception"] = rng.normal(size=(STATES, 3 * policy.num_actions))
     else:
         drawn["observation"] = rng.normal(size=(STATES, policy.num_observations))
-    if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
+    if isinstance(policy, VisionPolicy):
         shape = (STATES, GOLDEN_POINTS, 3)
         for name in ("goal_points", "seen_points"):
             drawn[name] = rng.normal(scale=GOLDEN_M, size=shape)
@@ -189,9 +188,9 @@ def _outputs(policy: AnyPolicy, golden: Tensors) -> Tensors:
     """The outputs of a policy on the CPU to golden inputs."""
     if isinstance(policy, StudentPolicy):
         return _student_answers(policy.network, golden)
-    teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
+    teacher = policy.teacher if isinstance(policy, VisionPolicy) else policy
     answers = {"action": teacher.act(golden["observation"])}
-    if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
+    if isinstance(policy, VisionPolicy):
         with torch.no_grad():
             turn = policy.alignment(golden["goal_points"], golden["seen_points"]).rotation
         answers["rotation"] = turn

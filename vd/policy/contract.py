@@ -39,7 +39,7 @@ CONVENTIONS = {
     "optical_frame": "x right, y down, z forward",
 }
 """How numbers are to be read."""
-Kind = Literal["teacher", "tracking", "vision", "student"]
+Kind = Literal["teacher", "vision", "student"]
 
 
 class ContractError(ValueError):
@@ -78,13 +78,11 @@ class CameraSpec(StoppingRules):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackingSpec(CameraSpec):
+class VisionSpec(CameraSpec):
     """How a teacher is let act by a camera."""
 
-    alignment: AlignmentCfg | None = None
-    """Sizes of the network that finds the object by the cloud of its goal; None: it is found by its
-    shape.
-    """
+    alignment: AlignmentCfg
+    """Sizes of the network that finds the object by the cloud of its goal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +105,7 @@ class Contract:
     """Configuration of the environment of its training."""
     iterations: int
     env_steps: int
-    tracking: TrackingSpec | None = None
+    tracking: VisionSpec | None = None
     """How the actor is let act on what a camera shows; None for teachers and students."""
     student: StudentSpec | None = None
     """What the student is; None for others."""
@@ -124,9 +122,7 @@ class Contract:
         """What a policy of this contract is called."""
         if self.student is not None:
             return "student"
-        if self.tracking is None:
-            return "teacher"
-        return "tracking" if self.tracking.alignment is None else "vision"
+        return "teacher" if self.tracking is None else "vision"
 
     @property
     def camera(self) -> CameraSpec | None:
@@ -289,7 +285,7 @@ def _hand(hand: HandModel) -> dict[str, Any]:
 def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     """The vector that a teacher's layers see.
 
-    Tracking and vision policies make it of joints and camera.
+    Vision policies make it of joints and camera.
     """
     from vd.kernels.task.observations import teacher_observation_slices
     from vd.kernels.task.shapes import shape_observation_size

@@ -1,4 +1,4 @@
-"""Teachers and tracking policies that were exported as ONNX, by onnxruntime, without torch.
+"""Teachers that were exported as ONNX, by onnxruntime, without torch.
 
 Such a file has the contract of the policy it was made of among its metadata, and its seal.
 """
@@ -6,12 +6,11 @@ Such a file has the contract of the policy it was made of among its metadata, an
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
 from vd.command import interrupt
-from vd.policy import SUFFIX
 from vd.policy.contract import (
     CONTRACT_KEY,
     Contract,
@@ -20,7 +19,6 @@ from vd.policy.contract import (
     contract_text,
     read_sealed,
 )
-from vd.tracking.policy import TrackingPolicy
 
 if TYPE_CHECKING:
     from vd.policy.actor import TrainedPolicy
@@ -71,21 +69,19 @@ class OnnxTeacher(Contracted):
         return self.network(observation)
 
 
-def onnx_metadata(policy: "TrainedPolicy | TrackingPolicy", contract: Contract) -> dict[str, str]:
-    """What a policy's ONNX file says of it, besides its layers."""
-    teacher: Any = policy.teacher if isinstance(policy, TrackingPolicy) else policy
+def onnx_metadata(teacher: "TrainedPolicy", contract: Contract) -> dict[str, str]:
+    """What a teacher's ONNX file says of it, besides its layers."""
     offset = json.dumps(teacher.network.offset[0].tolist())
     return {CONTRACT_KEY: contract_text(contract), OFFSET_KEY: offset}
 
 
-def read_onnx(path: Path) -> "OnnxTeacher | TrackingPolicy":
-    """The policy in a file.
+def read_onnx(path: Path) -> OnnxTeacher:
+    """The teacher in a file.
 
     Raises:
         FileNotFoundError: There is no such file.
         ModuleNotFoundError: onnxruntime is not installed.
-        ValueError: It is damaged, of a vision policy, of another version, or no file of
-            ``vd-train export``.
+        ValueError: It is damaged, of another version, or no file of ``vd-train export``.
     """
     interrupt.need("onnxruntime")
     data = read_sealed(path)
@@ -96,13 +92,4 @@ def read_onnx(path: Path) -> "OnnxTeacher | TrackingPolicy":
         raise ValueError(
             f"{path} holds no policy ({error}); write it anew with vd-train export"
         ) from error
-    contract = contract_of(text, path)
-    teacher = OnnxTeacher(network, contract)
-    if contract.tracking is None:
-        return teacher
-    if contract.tracking.alignment is not None:
-        raise ValueError(
-            f"{path} is of a vision policy, whose search computes with torch; give the policy's "
-            f"{SUFFIX} file"
-        )
-    return TrackingPolicy(cast(Any, teacher), contract)
+    return OnnxTeacher(network, contract_of(text, path))

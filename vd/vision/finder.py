@@ -3,13 +3,9 @@
 N environments, M seen points at most. Base frame; metres, quaternions xyzw.
 """
 
-from collections.abc import Sequence
-
-import numpy as np
 import torch
 from torch import Tensor
 
-from vd.assets_usd.objects.model import ObjectModel
 from vd.vision.alignment import Aligner, AlignmentNetwork
 from vd.vision.cfg import SEEN_POINTS
 from vd.vision.rotations import quaternions
@@ -35,12 +31,10 @@ class GoalFinder:
 
     Args:
         network: The network.
-        objects: The objects; of each the surface points are known.
-        world_object: Object of each environment [N].
-        world_scale: Size factor of each environment's object [N].
+        goals: Clouds of the goals, in the objects' frames and of true size [m] [N, P, 3].
 
     Attributes:
-        pose: Of the cloud's frame in the base frame [N, 1, 7].
+        pose: Of the cloud's frame in the base frame [N, 7].
         looks: How often each environment's object was seen since it was begun anew, [N] int32.
         most: Points seen of the object that are looked at.
         share: Which they are, as shares of all that are seen, in order [most].
@@ -50,24 +44,13 @@ class GoalFinder:
 
     most = SEEN_POINTS
 
-    def __init__(
-        self,
-        network: AlignmentNetwork,
-        objects: Sequence[ObjectModel],
-        *,
-        world_object: np.ndarray,
-        world_scale: np.ndarray,
-    ):
-        device = network.summary.device
-        envs = len(world_object)
-        surfaces = np.stack([item.surface_points for item in objects])
-        scale = np.asarray(world_scale)[:, None, None]
-        scaled = scale * surfaces[world_object]
-        goals = torch.tensor(scaled, dtype=torch.float32, device=device)
+    def __init__(self, network: AlignmentNetwork, goals: Tensor):
+        device = goals.device
+        envs = len(goals)
         self._mean = goals.mean(dim=1)
         self._aligner = Aligner(network, goals)
         self.share = (GOLDEN * torch.arange(SEEN_POINTS, device=device)) % 1.0
-        self.pose = torch.zeros((envs, 1, 7), device=device)
+        self.pose = torch.zeros((envs, 7), device=device)
         self.pose[..., 6] = 1.0
         self.looks = torch.zeros(envs, dtype=torch.int32, device=device)
         self.seen = torch.zeros((envs, SEEN_POINTS, 3), device=device)
@@ -99,7 +82,7 @@ class GoalFinder:
         middle = alignment.rotation @ self._mean[rows, :, None]
         place = alignment.position - middle.squeeze(-1)
         orientation = quaternions(alignment.rotation)
-        self.pose[rows, 0] = torch.cat([place, orientation], dim=1)
+        self.pose[rows] = torch.cat([place, orientation], dim=1)
         self.looks[rows] += 1
 
 

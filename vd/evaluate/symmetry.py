@@ -1,13 +1,14 @@
 """The rotations that map a shape onto itself, as far as a depth camera could tell.
 
-Registration proposes them: the shape's own samples are looked for, from many rotations. The whole
-surface decides, and that they form a group. A shape's own file may declare them, as those of our
-solids do. Object frame; quaternions xyzw.
+Many rotations are turned until the shape's own samples lie on it. The whole surface decides, and
+that they form a group. A shape's own file may declare them, as those of our solids do. Object
+frame; quaternions xyzw.
 """
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,11 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import Surface, random_surface_points
 from vd.assets_usd.objects.model import ObjectModel
-from vd.geometry.arrays import Array, library_of, library_on
-from vd.geometry.quaternions import product, rotation_distance
+from vd.geometry.quaternions import product
 from vd.kernels.launch import launch
-from vd.kernels.sensor.shape_grids import off_mesh_kernel
-from vd.tracking.registration import POINTS, Registration
+from vd.kernels.sensor.shape_grids import (
+    off_mesh_kernel,
+    shape_distance_kernel,
+    turn_onto_itself_kernel,
+)
 
 OFF_M = 0.003
 """A turned shape looks the same where it is no farther than this from where its surface was [m]: a
@@ -35,10 +38,20 @@ errors).
 """
 STICKS_OUT = 0.05
 """Nothing thin that is off by more than this share of the shape's length may be left over."""
+ROTATIONS = 2048
+"""Rotations that are tried, about 0.25 rad apart."""
 STEPS = 12
-"""Steps of each rotation that is tried."""
+"""Steps of each at most."""
+POINTS = 256
+"""Samples of which every so many-th is to lie on the shape."""
 EVERY = 2
-"""Every so many-th sample is looked at in these."""
+"""Which these are."""
+FAR_M = 0.012
+"""Length at which their distances are cut off [m]."""
+GRID = 32
+"""Grid points along a side of a shape's distances: some 5 mm apart."""
+BEYOND_M = 0.02
+"""How far that grid reaches beyond the shape [m]."""
 APART_RAD = 0.12
 """Least angle between two symmetries: a solid of revolution has some fifty."""
 BESIDE_RAD = 0.4
@@ -77,54 +90,37 @@ def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectM
     return [replace(item, symmetry=turns) for item, turns in zip(objects, found, strict=True)]
 
 
-def symmetries_of_worlds(
-    objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
-) -> np.ndarray:
-    """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer."""
-    found = symmetries(objects, device)
-    turns = np.zeros((len(found), max(map(len, found)), 4), dtype=np.float32)
-    turns[..., 3] = 1.0
-    for row, own in zip(turns, found, strict=True):
-        row[: len(own)] = own
-    return turns[np.asarray(world_object)]
-
-
-def nearest_goal(orientation: Array, goal: Array, turns: Array) -> Array:
-    """Of the orientations that look like the wanted one the nearest [N, 4].
-
-    Arguments [N, 4], [N, S, 4].
-    """
-    goals = product(goal[:, None], turns)
-    best = rotation_distance(orientation[:, None], goals).argmin(axis=1)
-    return goals[library_of(goals).arange(len(goals), device=goals.device), best]
-
-
 def _key(item: ObjectModel) -> bytes:
     """What tells one shape from another."""
     parts = (item.vertices, item.faces, item.surface_points)
     return hashlib.sha1(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).digest()
 
 
+def _even_rotations() -> np.ndarray:
+    """Rotations that lie evenly [ROTATIONS, 4] (super-Fibonacci spiral, Alexa 2022)."""
+    # Its two constants: the root of 2, and the positive root of x^4 = x + 4.
+    first = np.sqrt(2.0)
+    second = 1.533751168755204288118041
+    along = np.arange(ROTATIONS) + 0.5
+    share = along / ROTATIONS
+    turn = 2.0 * np.pi * along
+    inner = np.sqrt(share)
+    outer = np.sqrt(1.0 - share)
+    parts = [
+        inner * np.sin(turn / first),
+        inner * np.cos(turn / first),
+        outer * np.sin(turn / second),
+        outer * np.cos(turn / second),
+    ]
+    return np.stack(parts, axis=1)
+
+
 def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
-    """Symmetries of shapes: what registration of each with itself finds, measured on the whole surface."""
-    library = library_on(device)
-    itself = Registration(
-        items,
-        world_object=np.arange(len(items)),
-        world_scale=np.ones(len(items)),
-        camera=None,
-        device=device,
-        library=library,
-    )
-    # Samples are in an order in which any leading part of them is evenly spread.
-    place = wp.device_to_torch(device)
-    samples = np.stack([item.surface_points[:POINTS] for item in items])
-    seen = library.asarray(samples, dtype=library.float32, device=place)
-    count = library.full((len(items),), seen.shape[1], dtype=library.int32, device=place)
-    poses, misfits = itself.tried(seen, count, steps=STEPS, every=EVERY)
+    """Symmetries of shapes: rotations by which samples lie on them, measured on the whole surface."""
+    surfaces = [_Surface(item, device) for item in items]
+    turned, misfits = _turned(items, surfaces, device)
     found = []
-    for item, turns, misfit in zip(items, poses.numpy()[..., 3:], misfits.numpy(), strict=True):
-        surface = _Surface(item, device)
+    for surface, turns, misfit in zip(surfaces, turned, misfits, strict=True):
         # Where no more than a hundredth is off by more, the mean square is less, but for a few
         # outliers.
         likely = _apart(turns[misfit.argsort()[: int((misfit < OFF_M**2).sum())]])
@@ -134,15 +130,41 @@ def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
     return found
 
 
+def _turned(
+    items: Sequence[ObjectModel], surfaces: "Sequence[_Surface]", device: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [O, R, 4], each turned until samples lie on the shape, and misfits [m^2] [O, R]."""
+
+    def array(values: Any, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+    # In an order in which any leading part of them is evenly spread.
+    samples = np.stack([item.surface_points for item in items])
+    points = array(samples[:, :POINTS:EVERY], wp.vec3)
+    mean = array(samples[:, ::EVERY].mean(axis=1), wp.vec3)
+    place = array(samples[:, :POINTS].mean(axis=1), wp.vec3)
+    half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
+    mesh = array([surface.mesh.id for surface in surfaces], wp.uint64)
+    distances = wp.empty((len(items), GRID, GRID, GRID), dtype=float, device=device)
+    launch(shape_distance_kernel, distances.shape, [mesh, half], [distances])
+    begun = array(_even_rotations(), wp.quat)
+    turns = wp.empty((len(items), ROTATIONS), dtype=wp.quat, device=device)
+    misfits = wp.empty(turns.shape, dtype=float, device=device)
+    inputs = [distances, half, points, FAR_M, STEPS, mean, place, begun]
+    launch(turn_onto_itself_kernel, turns.shape, inputs, [turns, misfits])
+    return turns.numpy(), misfits.numpy()
+
+
 class _Surface:
     """The surface of a shape, and how much of it a turn takes off itself."""
 
     def __init__(self, item: ObjectModel, device: str):
         self._device = device
         rng = np.random.default_rng(0)
-        self._mesh = wp.Mesh(
+        self.mesh = wp.Mesh(
             wp.array(item.vertices, dtype=wp.vec3, device=device),
             wp.array(item.faces.ravel(), dtype=wp.int32, device=device),
+            support_winding_number=True,
         )
         samples = random_surface_points(Surface(item.vertices, item.faces), DENSE, rng)
         self._points = np.concatenate([samples, item.vertices])
@@ -157,7 +179,7 @@ class _Surface:
             return np.zeros(0)
         turned = np.einsum("rij,pj->rpi", Rotation.from_quat(turns).as_matrix(), self._points)
         points = wp.array(turned, dtype=wp.vec3, device=self._device)
-        mesh = wp.full(len(turns), self._mesh.id, dtype=wp.uint64, device=self._device)
+        mesh = wp.full(len(turns), self.mesh.id, dtype=wp.uint64, device=self._device)
         off = wp.empty(points.shape, dtype=float, device=self._device)
         launch(off_mesh_kernel, off.shape, [points, mesh], [off])
         found = off.numpy()

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
-from vd.geometry.arrays import Array, library_of
 from vd.geometry.quaternions import product, rotated
 from vd.kernels.task.observations import FINGERTIP_VALUES
 
@@ -19,13 +20,13 @@ class Fingertips:
 
     Args:
         hand: The hand.
-        array: Makes arrays of the library, device and precision in which joints are given.
+        array: Makes tensors of the device and precision in which joints are given.
 
     Raises:
         ValueError: Its fingers differ, or its joints are no chains from the base to each fingertip.
     """
 
-    def __init__(self, hand: HandModel, array: Callable[[Any], Array]) -> None:
+    def __init__(self, hand: HandModel, array: Callable[[Any], Tensor]) -> None:
         order = np.arange(hand.num_joints).reshape(-1, hand.joints_per_finger)
         frames = np.empty((len(order), hand.joints_per_finger + 1, 7))
         for finger, joints in enumerate(order):
@@ -44,30 +45,29 @@ class Fingertips:
         self._frame = array(frames)
         self._axis = array(hand.joint_axis[order])
 
-    def __call__(self, position: Array, velocity: Array) -> Array:
+    def __call__(self, position: Tensor, velocity: Tensor) -> Tensor:
         """Position [m], quaternion, velocity [m/s] and angular velocity [rad/s] of each fingertip in turn.
 
         Joint positions [rad] and velocities [rad/s] are [N, D]; columns [N, 13 G] as of
         :func:`vd.kernels.task.observations.teacher_observation_slices`.
         """
-        xp = library_of(position)
         shape = (len(position), *self._axis.shape[:2], 1)
         half = 0.5 * position.reshape(shape)
         rate = velocity.reshape(shape)
-        turn = xp.concatenate([self._axis * xp.sin(half), xp.cos(half)], axis=-1)
-        pose = xp.broadcast_to(self._frame[:, 0], (len(position), *self._frame[:, 0].shape))
-        spin = xp.zeros_like(pose[..., :3])
-        moment = xp.zeros_like(pose[..., :3])
+        turn = torch.cat([self._axis * torch.sin(half), torch.cos(half)], dim=-1)
+        pose = torch.broadcast_to(self._frame[:, 0], (len(position), *self._frame[:, 0].shape))
+        spin = torch.zeros_like(pose[..., :3])
+        moment = torch.zeros_like(pose[..., :3])
         for joint in range(self._axis.shape[1]):
             place = pose[..., :3]
             orientation = product(pose[..., 3:], turn[..., joint, :])
             axis = rate[..., joint, :] * rotated(orientation, self._axis[None, :, joint])
             spin = spin + axis
-            moment = moment + xp.linalg.cross(axis, place)
+            moment = moment + torch.linalg.cross(axis, place)
             following = self._frame[None, :, joint + 1]
             place = place + rotated(orientation, following[..., :3])
-            pose = xp.concatenate([place, product(orientation, following[..., 3:])], axis=-1)
+            pose = torch.cat([place, product(orientation, following[..., 3:])], dim=-1)
         # Each joint moves the tip by its axis x (tip - joint).
-        linear = xp.linalg.cross(spin, pose[..., :3]) - moment
-        values = xp.concatenate([pose, linear, spin], axis=-1)
+        linear = torch.linalg.cross(spin, pose[..., :3]) - moment
+        values = torch.cat([pose, linear, spin], dim=-1)
         return values.reshape(len(position), FINGERTIP_VALUES * len(self._axis))

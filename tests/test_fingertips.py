@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.kernels.task.observations import FINGERTIP_VALUES
-from vd.tracking.fingertips import Fingertips
+from vd.vision.fingertips import Fingertips
 
 HANDS = ("dclaw3", "dclaw4")
 STEP_S = 1e-5

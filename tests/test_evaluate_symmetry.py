@@ -1,17 +1,16 @@
-"""The rotations that map a shape onto itself are found, and goals that look alike are one goal."""
+"""The rotations that map a shape onto itself are found."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import surface_points
 from vd.assets_usd.objects.model import IDENTITY, ObjectModel
 from vd.assets_usd.objects.sets import load_set
-from vd.tracking.symmetry import APART_RAD, CLOSED_RAD, MOST, nearest_goal, symmetries
+from vd.evaluate.symmetry import APART_RAD, CLOSED_RAD, MOST, symmetries
 
 NEAR_RAD = 0.05
 """A symmetry that was found, from its true rotation."""
@@ -77,18 +76,3 @@ def test_declared_symmetries_stand():
     cube = load_set(["cube"])[0]
     (found,) = symmetries([cube], "cpu")
     np.testing.assert_allclose(found, cube.symmetry, atol=1e-6)
-
-
-def test_the_nearest_of_the_goals_that_look_alike_is_the_goal():
-    rng = np.random.default_rng(0)
-    orientation, goal = Rotation.random(20, rng=rng), Rotation.random(20, rng=rng)
-    group = Rotation.create_group("O")
-    near = nearest_goal(
-        *(torch.tensor(turn.as_quat()) for turn in (orientation, goal)),
-        torch.tensor(group.as_quat()).expand(20, -1, -1),
-    )
-    for row in range(20):
-        angles = (orientation[row].inv() * goal[row] * group).magnitude()
-        chosen = Rotation.from_quat(near[row].numpy())
-        assert np.isclose((orientation[row].inv() * chosen).magnitude(), angles.min())
-        assert (goal[row].inv() * chosen * group).magnitude().min() < 1e-6

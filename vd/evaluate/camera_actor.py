@@ -7,17 +7,16 @@ import torch
 import warp as wp
 
 from vd.evaluate.goals import Goals
-from vd.evaluate.scanned import known_objects
+from vd.evaluate.scanned import known_points
 from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
-from vd.tracking.policy import TrackingPolicy
-from vd.tracking.tracker import Tracker
 from vd.vision.acting import ActingStudent, StudentPolicy
+from vd.vision.acting_teacher import ActingTeacher, VisionPolicy
 
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
 
-AnyCameraPolicy = TrackingPolicy | StudentPolicy
+AnyCameraPolicy = VisionPolicy | StudentPolicy
 
 
 def sensed(env: "ReorientEnv", camera: DepthCamera) -> Senses:
@@ -66,7 +65,7 @@ class CameraActor:
         env: "ReorientEnv",
         policy: AnyCameraPolicy,
         *,
-        goals: Goals = "mesh",
+        goals: Goals = "points",
         sensor_errors: bool = False,
         seed: int = 0,
     ):
@@ -86,26 +85,15 @@ class CameraActor:
             seed=seed,
         )
         place = wp.device_to_torch(env.device)
-        known = known_objects(
-            env.objects, goals, seed=seed, device=env.device, surfaces=policy.kind == "tracking"
-        )
-        self.tracker: Tracker | ActingStudent
+        clouds = known_points(env.objects, goals, seed=seed)[env.scene.world_object]
+        scaled = clouds * np.asarray(env.scene.world_scale)[:, None, None]
+        goal_clouds = torch.tensor(scaled, dtype=torch.float32, device=place)
+        self.tracker: ActingTeacher | ActingStudent
         if isinstance(policy, StudentPolicy):
-            clouds = np.stack([item.surface_points for item in known])[env.scene.world_object]
-            scaled = clouds * np.asarray(env.scene.world_scale)[:, None, None]
             policy.network.half = place.startswith("cuda")
-            goal_clouds = torch.tensor(scaled, dtype=torch.float32, device=place)
             self.tracker = ActingStudent(policy.network, env.hand, goal_clouds)
         else:
-            self.tracker = Tracker(
-                policy,
-                env.hand,
-                known,
-                camera,
-                world_object=env.scene.world_object,
-                world_scale=env.scene.world_scale,
-                device=env.device,
-            )
+            self.tracker = ActingTeacher(policy, env.hand, goal_clouds)
         self.predicted = torch.zeros(env.num_envs, device=place)
         self.active = torch.ones(env.num_envs, dtype=torch.bool, device=place)
 
