@@ -84,8 +84,7 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
     import torch
 
     from vd.policy.actor import TrainedPolicy
-    from vd.policy.contract import SEAL_KEY, UNSEALED, sealed
-    from vd.policy.onnx import onnx_metadata
+    from vd.policy.contract import CONTRACT_KEY, SEAL_KEY, UNSEALED, contract_text, sealed
 
     if not isinstance(policy, TrainedPolicy):
         raise ValueError(
@@ -113,8 +112,8 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
             verbose=False,
         )
         model = onnx.load(temporary)
-        metadata = onnx_metadata(policy, contract)
-        onnx.helper.set_model_props(model, metadata | {SEAL_KEY: UNSEALED.decode()})
+        metadata = {CONTRACT_KEY: contract_text(contract), SEAL_KEY: UNSEALED.decode()}
+        onnx.helper.set_model_props(model, metadata)
         temporary.write_bytes(sealed(model.SerializeToString()))
         if find_spec("onnxruntime") is None:
             print(

@@ -1,8 +1,8 @@
 """What to reach: an object's shape, from its USD or any scan, and orientations for it.
 
 A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface
-is laid through it, by which a tracking policy finds the object; it need not be closed before, as
-for a simulation (vd-assets import).
+is laid through it, by whose points policies find the object; it need not be closed before, as for a
+simulation (vd-assets import).
 
 Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the
 object is in its file, in the world frame.

@@ -11,11 +11,11 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.statistics import symmetric_error
-from vd.geometry.arrays import as_warp, library_of, of_warp
+from vd.geometry.arrays import as_warp
 from vd.paper import PAPER
 from vd.policy import ONNX_SUFFIX, has_suffix
 from vd.policy.agents import check_fits, open_policy, task_for
-from vd.policy.onnx import read_onnx
+from vd.policy.onnx import OnnxTeacher, read_onnx
 from vd.policy.senses import Senses
 from vd.policy.stopping import StoppingRule
 from vd.sensors.depth_cloud import CameraCloud
@@ -184,8 +184,9 @@ class TeacherPolicyRunner(PolicyRunner):
         """Mean action [D] for what the environment observes."""
         env = self._env
         env.observe()
-        observation = of_warp(env.observation, library_of(self._policy.network.offset))
-        action = as_warp(self._policy.act(observation))
+        without_torch = isinstance(self._policy, OnnxTeacher)
+        told = env.observation.numpy() if without_torch else wp.to_torch(env.observation)
+        action = as_warp(self._policy.act(told))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
         mean: np.ndarray = action.numpy()[0].copy()

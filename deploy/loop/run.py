@@ -2,7 +2,7 @@
 
 Pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-The policy sees joints and a depth camera: a tracking or vision policy. A teacher is told where the
+The policy sees joints and a depth camera: a vision policy or a student. A teacher is told where the
 object is: by --pose, or by a twin, which tells the truth. A policy that turns the object without a
 goal (leap-spin) senses its joints alone.
 """

@@ -1,1 +1,1 @@
-"""Kernels of the senses: depth images, their errors, clouds, and where a known shape is in them."""
+"""Kernels of the senses: depth images, their errors, clouds; and distances from shapes."""

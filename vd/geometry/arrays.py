@@ -30,8 +30,3 @@ def as_warp(array: Array, dtype: Any = None) -> wp.array:
         return wp.array(np.ascontiguousarray(array), dtype=dtype or Any, copy=False, device="cpu")
     wp.init()  # which ``from_torch`` alone leaves out
     return wp.from_torch(array.contiguous(), dtype=dtype)
-
-
-def of_warp(array: wp.array, library: Any) -> Array:
-    """The memory of a Warp array for a library; vectors and the like are the last axis."""
-    return array.numpy() if library is np else wp.to_torch(array)

@@ -3,28 +3,14 @@
 Such a file has the contract of the policy it was made of among its metadata, and its seal.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 
 from vd.command import interrupt
-from vd.policy.contract import (
-    CONTRACT_KEY,
-    Contract,
-    Contracted,
-    contract_of,
-    contract_text,
-    read_sealed,
-)
-
-if TYPE_CHECKING:
-    from vd.policy.actor import TrainedPolicy
-
-OFFSET_KEY = "offset"
-"""Key of the mean of observations in training, in JSON, among the metadata."""
+from vd.policy.contract import CONTRACT_KEY, Contract, Contracted, contract_of, read_sealed
 
 
 class OnnxNetwork:
@@ -32,7 +18,6 @@ class OnnxNetwork:
 
     Attributes:
         metadata: What the file says of itself, by key.
-        offset: Mean of observations in training [1, O].
     """
 
     def __init__(self, data: bytes):
@@ -43,13 +28,6 @@ class OnnxNetwork:
         providers = ["CPUExecutionProvider"]
         self._session = onnxruntime.InferenceSession(data, options, providers=providers)
         self.metadata = self._session.get_modelmeta().custom_metadata_map
-        self.offset = np.array(json.loads(self.metadata[OFFSET_KEY]), dtype=np.float32)[None]
-
-    def to(self, device: str) -> "OnnxNetwork":
-        """Itself, on the CPU."""
-        if device != "cpu":
-            raise ValueError(f"a policy as ONNX runs on the CPU, not on {device}")
-        return self
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Mean actions [N, D] of observations [N, O]."""
@@ -67,12 +45,6 @@ class OnnxTeacher(Contracted):
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Mean actions [N, D] for observations [N, O]."""
         return self.network(observation)
-
-
-def onnx_metadata(teacher: "TrainedPolicy", contract: Contract) -> dict[str, str]:
-    """What a teacher's ONNX file says of it, besides its layers."""
-    offset = json.dumps(teacher.network.offset[0].tolist())
-    return {CONTRACT_KEY: contract_text(contract), OFFSET_KEY: offset}
 
 
 def read_onnx(path: Path) -> OnnxTeacher:
