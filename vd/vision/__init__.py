@@ -1,4 +1,4 @@
-"""Finding an object by the cloud of its goal.
+"""Policies that see by a camera: the object found by its goal's cloud, and who acts on it.
 
-A network that turns one cloud onto another, and its search.
+Teachers act by a network that turns one cloud onto another, students by networks of their own.
 """
