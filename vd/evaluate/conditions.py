@@ -52,7 +52,7 @@ MASS_KG = (0.03, 0.18)
 OFF_CENTRE_M = 0.01
 """How far the centre of mass is off [m] (ours): objects are 10 to 16 cm long."""
 POSE_ERROR = (0.005, 0.1)
-"""Errors of the object's pose [m] [rad] (ours), all through an episode: a bad tracker."""
+"""Errors of the object's pose [m] [rad] (ours), all through an episode: a bad registration."""
 
 TRACKED_POSE = TrackedPoseCfg(rate_hz=(10.0, 30.0))
 """A tracker outside, as vd-deploy --pose has it."""
