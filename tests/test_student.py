@@ -105,7 +105,7 @@ def test_what_it_says_depends_on_every_thing_that_it_reads():
 def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
     network = student()
     steps = [sights((3,), seed) for seed in range(4)]
-    told = torch.stack([network.look(sight).told for sight in steps])
+    told = torch.stack([network.told(sight, network.look(sight).belief) for sight in steps])
     done = torch.zeros((4, 3), dtype=torch.bool)
     done[1, 0] = done[3, 2] = True
     whole = network(told, torch.ones(3, SMALL.memory), done)
@@ -144,7 +144,7 @@ def test_it_reads_nothing_out_of_reach():
         points = sight.belief.position[:, None] + step * (far - sight.belief.position[:, None])
         camera = torch.cat([sight.camera, points], dim=1)
         found = network.look(dataclasses.replace(sight, camera=camera))
-        assert torch.allclose(found.told, read.told, atol=1e-6) != seen
+        assert torch.allclose(found.flow.shift, read.flow.shift, atol=1e-6) != seen
         assert (found.voxels == read.voxels + seen).all()
 
 
@@ -383,7 +383,11 @@ class Told(torch.nn.Module):
         truth = self.frames.turn[sight.frame] @ self.truth
         seen = sight.camera.isfinite().any(dim=2).any(dim=1)
         better, doubt = self.better(believed, truth)
-        return Look(doubt, either(seen, better, believed), doubt, doubt, None)
+        return Look(either(seen, better, believed), doubt, doubt, None)
+
+    def told(self, sight: StudentInput, belief: Belief) -> torch.Tensor:
+        """Where it believes the object to be."""
+        return belief.position
 
     def better(self, believed: Belief, truth: torch.Tensor) -> tuple[Belief, torch.Tensor]:
         """What it believes where it sees, and how much it doubts that."""

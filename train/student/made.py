@@ -61,7 +61,7 @@ def sought(acting: ActingStudent, senses: Senses, truth: Belief, rows: Tensor) -
     position = torch.where(seen.isfinite(), seen, off(truth).position)
     belief = Belief(random_matrices(len(rows), rows.device), position)
     for _ in range(int(torch.randint(PASSES, ()))):
-        belief = acting.improved(senses, belief, rows).belief
+        _, _, belief = acting.glance(senses, belief, rows)
     sight = acting.build(senses, belief, rows)
     return Looks(sight, acting.build.frames.belief_in(truth, sight.frame))
 

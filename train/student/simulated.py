@@ -183,7 +183,7 @@ class SimulatedSequences:
             sight = acting.build(senses, belief, clouds=False)
             return sight, acting.network.told(sight, sight.belief), sight.belief
         sight, look = acting.look(senses, off(place))
-        return sight, look.told, look.belief
+        return sight, acting.network.told(sight, look.belief), look.belief
 
     def _learned(self) -> Tensor:
         """Environments whose looks of a step are learned from, drawn at random, int64 [R]."""

@@ -115,9 +115,7 @@ class ActingStudent:
         self.forget(senses.fresh)
         self.belief = either(self.lost, begin, self.belief)
         self.lost = torch.zeros_like(self.lost)
-        sight = self.build(senses, self.belief)
-        look = self.network.look(sight)
-        self.belief = self._kept(look, sight)
+        sight, look, self.belief = self.glance(senses, self.belief)
         return sight, look
 
     @torch.no_grad()
@@ -155,9 +153,8 @@ class ActingStudent:
             position = senses.points[some].nanmean(dim=1)
             belief = Belief(rotation.flatten(0, 1), position.repeat_interleave(starts, dim=0))
             for _ in range(PASSES):
-                sighting = self.improved(now, belief, every)
-                belief = sighting.belief
-            self._rivals.begin(some, belief, sighting.doubt)
+                _, look, belief = self.glance(now, belief, every)
+            self._rivals.begin(some, belief, look.doubt)
             best = self._rivals.of(some, self._rivals.best(some))
             self.belief.rotation[some] = best.rotation
             self.belief.position[some] = best.position
@@ -182,22 +179,25 @@ class ActingStudent:
 
     def improved(self, senses: Senses, belief: Belief, rows: Tensor | None = None) -> Sighting:
         """What hands see by beliefs [R]; ``rows`` as of an :class:`InputBuilder`."""
-        sight = self.build(senses, belief, rows)
-        look = self.network.look(sight)
+        sight, look, kept = self.glance(senses, belief, rows)
         return Sighting(
-            told=look.told,
+            told=self.network.told(sight, look.belief),
             frame=sight.frame,
-            belief=self._kept(look, sight),
+            belief=kept,
             angle=turn_angle(look.belief.rotation.mT @ sight.goal_rotation),
             doubt=look.doubt,
             voxels=look.voxels,
         )
 
-    def _kept(self, look: Look, sight: StudentInput) -> Belief:
-        """What a look leaves to believe, base frame."""
-        belief = self.build.frames.belief_out(look.belief, sight.frame)
+    def glance(
+        self, senses: Senses, belief: Belief, rows: Tensor | None = None
+    ) -> tuple[StudentInput, Look, Belief]:
+        """What is read and seen by beliefs [R], and what that leaves to believe, base frame."""
+        sight = self.build(senses, belief, rows)
+        look = self.network.look(sight)
+        better = self.build.frames.belief_out(look.belief, sight.frame)
         # One that strayed would have nothing in sight to come back by.
-        return self.build.near_place(belief, self.network.cfg.reach_m)
+        return sight, look, self.build.near_place(better, self.network.cfg.reach_m)
 
     def decide(self, told: Tensor, frame: Tensor) -> Decision:
         """What the network decides by what it is told in frames, in the order of the joints.
@@ -210,16 +210,16 @@ class ActingStudent:
 
     @torch.inference_mode()
     def step(self, senses: Senses) -> CameraDecision:
-        """One control step."""
+        """One control step; what is given is for inference alone."""
         sighting = self.follow(senses)
         decision = self.decide(sighting.told, sighting.frame)
         pose = self.pose
         turn = self._base[:, 3:]
+        # What was never seen is not stopped.
+        angle = sighting.angle.masked_fill(self.lost, torch.pi)
         return CameraDecision(
             action=decision.action,
-            angle=sighting.angle.masked_fill(
-                self.lost, torch.pi
-            ),  # or what was never seen would be stopped
+            angle=angle,
             position=self._base[:, :3] + rotated(turn, pose[:, :3]),
             orientation=product(turn, pose[:, 3:]),
             voxels=sighting.voxels,

@@ -64,8 +64,6 @@ class Flow:
 class Look:
     """What R looks show, without memory."""
 
-    told: Tensor
-    """What is told of it, through which no gradient flows [R, S]."""
     belief: Belief
     """The better belief [R]."""
     doubt: Tensor
@@ -223,7 +221,7 @@ class Student(nn.Module):
         better = either(seen == 0.0, believed, Belief(rotation, position))
         of_look = torch.bincount(flow.look, minlength=looks)
         doubt = torch.segment_reduce(flow.log_scale, "mean", lengths=of_look, unsafe=True)
-        return Look(self.told(sight, better).detach(), better, doubt, seen, flow)
+        return Look(better, doubt, seen, flow)
 
     def _convolve(self, voxels: SparseTensor) -> list[SparseTensor]:
         """Features of the cells of each stage."""
@@ -281,7 +279,7 @@ class Student(nn.Module):
     def act(self, sight: StudentInput, hidden: Tensor) -> tuple[Look, Decision]:
         """Look, and decide: one step of N hands, leading axes [N]."""
         look = self.look(sight)
-        return look, self.decide(look.told, hidden)
+        return look, self.decide(self.told(sight, look.belief), hidden)
 
     def _within_reach(self, points: Tensor) -> Tensor:
         """Points [.., 3] about the object's place; NaN for those that are out of reach."""
