@@ -228,7 +228,7 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
 
     monkeypatch.setattr(suite_run, "compare", spoiled)
     run(tmp_path, TEACHER, CAMERA, suite="robust", objects=("held-out=cube",))
-    of_state = {"observation-late", "all-late", "pose-error", "tracked", "mixed-tracked"}
+    of_state = {"observation-late", "all-late", "tracked", "mixed-tracked"}
     names = [c.name for c in ROBUST]
     of_goals = set(get_args(Condition)) - {"hora"}  # under which objects are spun
     assert set(names) == {*of_goals, "air-nominal", "air-mixed"} and names[0] == "nominal"

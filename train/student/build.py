@@ -42,7 +42,6 @@ def student_task(teacher: TrainedPolicy, cfg: StudentTrainCfg) -> ReorientCfg:
         observation_offset_std=0.0,
         observation_latency_s=(0.0, 0.0),
         encoder_latency_s=(0.0, 0.0),
-        object_pose_error=(0.0, 0.0),
         tracked_pose=TrackedPoseCfg(),
     )
     if cfg.stage == RENDERED and draws.enabled:

@@ -423,10 +423,6 @@ class RandomisationCfg:
     encoder_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step
     begins. Drawn at the same share of its range as the object's."""
-    object_pose_error: tuple[float, float] = (0.0, 0.0)
-    """Ours: by how much the observed pose of the object is wrong [m] [rad], alike all through an
-    episode.
-    """
     tracked_pose: TrackedPoseCfg = field(default_factory=TrackedPoseCfg)
     """The object's pose as a tracker tells it, in place of ``observation_latency_s``."""
     redraw_s: float = PAPER.randomisation.redraw_s

@@ -8,7 +8,6 @@ import warp as wp
 from vd.envs.history import JointHistory
 from vd.envs.latency import SeenState
 from vd.envs.parts import actor_size, observation_parts
-from vd.envs.pose_error import PoseError
 from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import ChosenFrames
@@ -44,7 +43,6 @@ class Observer:
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
         self._tracked_pose = TrackedPose(state, self.seen)
-        self._pose_error = PoseError(state)
         self._history = JointHistory(state, self.parts)
         width = max(columns.stop for columns in self.parts.values())
 
@@ -91,7 +89,6 @@ class Observer:
         """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
         self.seen.begin(mask)
         self._tracked_pose.begin(mask)
-        self._pose_error.begin(mask)
         self._history.begin(mask)
 
     def observe(self) -> None:
@@ -99,7 +96,7 @@ class Observer:
         state = self._state
         self._tracked_pose.take()
         self.seen.recall()
-        seen = self._pose_error.apply(self._tracked_pose.hold(self.seen.arrays))
+        seen = self._tracked_pose.hold(self.seen.arrays)
         noise = state.parameters.observation, self._drawn.observation_offset, state.rng
         self._observe_state(seen, noise, self.world_values[:, self.parts["state"].start :])
         self._history.push(self.world_values)

@@ -51,8 +51,6 @@ MASS_KG = (0.03, 0.18)
 """The paper's base range of the object's mass [kg]."""
 OFF_CENTRE_M = 0.01
 """How far the centre of mass is off [m] (ours): objects are 10 to 16 cm long."""
-POSE_ERROR = (0.005, 0.1)
-"""Errors of the object's pose [m] [rad] (ours), all through an episode: a bad registration."""
 
 TRACKED_POSE = TrackedPoseCfg(rate_hz=(10.0, 30.0))
 """A tracker outside, as vd-deploy --pose has it."""
@@ -124,10 +122,6 @@ _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
     "off-centre": (f"centre of mass {OFF_CENTRE_M:g} m off", _only(object_com_m=OFF_CENTRE_M)),
     "soft-tips": ("soft fingertips", _only(enabled=False)),
     "stiff-contacts": ("contacts twice as stiff, physics steps half as long", _only(enabled=False)),
-    "pose-error": (
-        f"object seen {POSE_ERROR[0]:g} m and {POSE_ERROR[1]:g} rad off",
-        _only(object_pose_error=POSE_ERROR),
-    ),
 }
 """What is changed, in words, and what is drawn; two changes are no draws (:func:`in_condition`)."""
 CHANGED = {name: words for name, (words, _) in _NAMED.items()}
