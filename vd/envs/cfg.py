@@ -18,7 +18,10 @@ memory.
 """
 SLOWEST_POSES_HZ = 2.0
 """Fewest poses a second of a tracker (ours): as much of the past is kept in memory."""
-GONE = {"start": {"reached_share": 0.0}, "randomisation": {"observation_jitter_s": 0.0}}
+GONE: dict[str, dict[str, Any]] = {
+    "start": {"reached_share": 0.0},
+    "randomisation": {"observation_jitter_s": 0.0, "object_pose_error": [0.0, 0.0]},
+}
 """Settings that are gone, by group, and what they were where they did nothing: policies have them so.
 Others are refused."""
 View = Literal["world", "goal", "mirrored"]
