@@ -12,6 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save
 
 from vd.assets_usd.hands import load_hand
+from vd.command.config import from_dict
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.cli import main as evaluate
 from vd.policy.agents import SHIPPED_POLICIES, open_policy
@@ -118,7 +119,7 @@ def test_every_flipped_byte_is_noticed(path):
         (lambda v: v["task"].update(gone=1), r"contract\.task has no field gone"),
         (
             lambda v: v["task"]["start"].update(reached_share=0.3),
-            r"contract\.task\.start has no field reached_share",
+            r"contract\.task\.start\.reached_share = 0\.3 is gone",
         ),
         (lambda v: v["network"].update(hidden=3), r"contract\.network\.hidden: expected a list"),
     ],
@@ -130,12 +131,18 @@ def test_what_this_version_does_not_know_is_refused_by_file_and_field(path, chan
 
 
 @pytest.mark.parametrize(
-    ("group", "name"), [("start", "reached_share"), ("randomisation", "observation_jitter_s")]
+    ("group", "name", "off"),
+    [
+        ("start", "reached_share", 0.0),
+        ("randomisation", "observation_jitter_s", 0.0),
+        ("randomisation", "object_pose_error", [0.0, 0.0]),
+    ],
 )
-def test_a_setting_that_is_gone_is_read_where_it_was_off(path, group, name):
+def test_a_setting_that_is_gone_is_read_where_it_was_off(path, group, name, off):
     before = ReorientCfg.of(read_policy(path))
-    edit(path, lambda v: v["task"][group].update({name: 0.0}))
+    edit(path, lambda v: v["task"][group].update({name: off}))
     assert ReorientCfg.of(read_policy(path)) == before
+    assert from_dict(ReorientCfg, {group: {name: off}}) == ReorientCfg(), "of a run's config too"
 
 
 def test_weights_that_are_others_are_refused(path):

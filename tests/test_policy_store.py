@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from vd.policy.agents import SHIPPED_POLICIES, find_policy, pulled_folder
+from vd.policy.agents import SHIPPED_POLICIES, default_policy, find_policy, pulled_folder
+from vd.policy.contract import UNSEALED, sealed
 from vd.policy.store import main
 
 CUBE, OTHER = (SHIPPED_POLICIES[name].read_bytes() for name in ("dclaw4-cube", "dclaw4"))
@@ -58,6 +59,17 @@ def test_what_is_damaged_or_has_no_name_is_refused(place, tmp_path, capsys):
     assert "no such folder" in said("list", "--at", str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError, match="vd-policies pull NAME --at PLACE"):
         find_policy("nobody")
+
+
+def test_a_policy_of_another_version_is_not_pulled_and_hinders_no_other(place, capsys):
+    changed = CUBE.replace(b"visual-dexterity policy 1", b"visual-dexterity policy 9")
+    (place / "mine.safetensors").write_bytes(sealed(changed[: -len(UNSEALED)] + UNSEALED))
+    pull = ("pull", "mine", "--at", str(place))
+    assert "take the version" in refused(capsys, *pull) and not pulled_folder().exists()
+    shutil.copytree(place, pulled_folder())
+    assert main(["list"]) == 0
+    assert re.search(r"^mine +cannot be used: .*this version reads", capsys.readouterr().out, re.M)
+    assert default_policy("dclaw4", "teacher") == "dclaw4"
 
 
 def test_a_repository_of_hugging_face_is_read_and_written_by_its_own_library(

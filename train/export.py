@@ -88,7 +88,7 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
 
     if not isinstance(policy, TrainedPolicy):
         raise ValueError(
-            f"{path}: what a {policy.kind} policy sees by is not exported to ONNX; give its teacher"
+            f"{path}: what a {policy.kind} policy sees by is not exported to ONNX; give a teacher"
         )
     interrupt.need("onnx", "onnxscript")
     import onnx

@@ -173,7 +173,10 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
         try:
             alignment = default_policy(teacher.hand, "vision")
         except ValueError as error:
-            raise ValueError(f"--alignment names what finds the object: {error}") from error
+            raise ValueError(
+                f"--alignment names what finds the object, a vision policy or what vd-train "
+                f"alignment made: {error}"
+            ) from error
         print(f"--alignment {alignment}: the network of the hand's installed vision policy")
     network, camera = open_network(alignment, device)
     spec = VisionSpec(

@@ -40,12 +40,14 @@ def from_dict(
 
     Fields that are absent keep their default.
 
-    With ``over`` they are as in that one, in groups too.
+    With ``over`` they are as in that one, in groups too. Fields of earlier versions, which
+    ``cls.GONE`` names, may be there with the value by which they did nothing.
 
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of
             the wrong type, named by its path, which begins with ``where``.
     """
+    values = _without_gone(cls, values, where)
     hints = typing.get_type_hints(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     names = {field.name for field in fields}
@@ -66,6 +68,20 @@ def from_dict(
     if over is None:
         return cls(**converted)
     return dataclasses.replace(over, **converted)  # type: ignore[type-var]
+
+
+def _without_gone(cls: type, values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The fields but those that are gone and did nothing.
+
+    Raises:
+        ValueError: One that is gone did something.
+    """
+    kept = dict(values)
+    for name, off in getattr(cls, "GONE", {}).items():
+        value = kept.pop(name, off)
+        if to_dict(value) != off:
+            raise ValueError(f"{where or cls.__name__}.{name} = {value} is gone; {off} is allowed")
+    return kept
 
 
 def needed(cls: type) -> set[str]:

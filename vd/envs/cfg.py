@@ -3,7 +3,7 @@
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field, replace
 from math import pi
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from vd.command.config import from_dict, require
 from vd.paper import PAPER
@@ -18,12 +18,6 @@ memory.
 """
 SLOWEST_POSES_HZ = 2.0
 """Fewest poses a second of a tracker (ours): as much of the past is kept in memory."""
-GONE: dict[str, dict[str, Any]] = {
-    "start": {"reached_share": 0.0},
-    "randomisation": {"observation_jitter_s": 0.0, "object_pose_error": [0.0, 0.0]},
-}
-"""Settings that are gone, by group, and what they were where they did nothing: policies have them so.
-Others are refused."""
 View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -203,6 +197,7 @@ class GoalCfg:
 class StartCfg:
     """How the object starts."""
 
+    GONE: ClassVar = {"reached_share": 0.0}
     at_rest: bool = False
     """Start at rest on the table, turned about the vertical at random, rather than falling (paper).
     Goals near the start are then near a pose that lasts."""
@@ -364,6 +359,7 @@ class TrackedPoseCfg:
 class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
+    GONE: ClassVar = {"observation_jitter_s": 0.0, "object_pose_error": [0.0, 0.0]}
     enabled: bool = True
     """Randomise at all."""
     stiffness_scale: tuple[float, float] = PAPER.randomisation.stiffness_scale
@@ -525,12 +521,6 @@ class ReorientCfg:
             ValueError: It is of another version; ``where`` says what it is.
         """
         kept = {name: value for name, value in task.items() if name != "curriculum"}
-        for group, gone in GONE.items():
-            fields = dict(kept.get(group, {}))
-            for name, off in gone.items():
-                if fields.get(name) == off:
-                    del fields[name]
-            kept[group] = fields
         return from_dict(cls, kept, where=where)
 
     @property

@@ -34,6 +34,7 @@ OF_GOALS = (
     "goals",
     "stop_tolerance",
     "max_goal_angle",
+    "table_friction",
 )
 """Settings that mean nothing where there is no goal."""
 _HEADER = ("policy", "object", "revolutions", "turned before a drop", "dropped", "held [s]")

@@ -202,6 +202,11 @@ def make_tasks(
 
     All names are looked up here, before anything slow.
     """
+    from vd.evaluate.spin import spins
+
+    for name in cfg.agent_names:
+        if spins(open_policy(name, "cpu")):
+            raise ValueError(f"{name} turns objects without a goal; evaluate it without --suite")
     short = labels(cfg.agent_names)
     by_camera: list[SuiteTask] = []
     others: list[SuiteTask] = []

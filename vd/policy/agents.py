@@ -83,11 +83,14 @@ def default_policy(hand: str, *kinds: str) -> str:
         ValueError: The hand has none.
     """
     from vd.assets_usd.hands import root_name
-    from vd.policy.contract import installed_contract
+    from vd.policy.contract import ContractError, installed_contract
 
     kind_of = {}
     for name, path in installed_policies().items():
-        contract = installed_contract(path)
+        try:
+            contract = installed_contract(path)
+        except ContractError:
+            continue  # of another version; who names it is told so
         if contract.task["hand"] == root_name(hand):
             kind_of[name] = contract.kind
     for kind in kinds:

@@ -25,7 +25,7 @@ from vd.policy.agents import (
     policy_name,
     pulled_folder,
 )
-from vd.policy.contract import installed_contract, read_sealed, without_folders
+from vd.policy.contract import ContractError, installed_contract, read_sealed, without_folders
 
 HUB = "hf://"
 """How the name of a repository of Hugging Face begins."""
@@ -78,13 +78,15 @@ def pull(name: str, place: str, *, replace: bool = False) -> Path:
     Raises:
         FileExistsError: There is another policy of this name, and ``replace`` is not set.
         OSError: The place does not answer, or the file cannot be written.
-        ValueError: There is no such policy, or it is damaged.
+        ValueError: There is no such policy, it is damaged, or of another version.
     """
     available = names_at(place)
     if name not in available:
         raise ValueError(f"{place} has no policy {name}; it has {', '.join(available) or 'none'}")
     check_name(name)
-    content = read_sealed(fetch(name, place))
+    file = fetch(name, place)
+    content = read_sealed(file)
+    installed_contract(file)
     target = pulled_folder() / f"{name}{SUFFIX}"
     present = SHIPPED_POLICIES.get(name, target)
     if present.exists():
@@ -161,7 +163,11 @@ class List:
         """Print a line for each."""
         installed = installed_policies()
         for name, path in installed.items():
-            contract = installed_contract(path)
+            try:
+                contract = installed_contract(path)
+            except ContractError as error:
+                print(f"{name:<24} cannot be used: {error}")
+                continue
             size = f"{path.stat().st_size / 1e6:5.1f} MB"
             objects = ", ".join(contract.task["objects"]) + _sizes(contract.task["randomisation"])
             print(f"{name:<24} {contract.kind:<9} {contract.task['hand']:<10} {size}  {objects}")
