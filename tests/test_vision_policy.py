@@ -376,4 +376,4 @@ def test_without_a_vision_policy_of_the_hand_a_network_has_to_be_named(monkeypat
 
     monkeypatch.setattr("vd.train.tracker.default_policy", none)
     assert vd_train(["tracker", "dclaw3", "--objects", "cube", "--device", "cpu"]) == 1
-    assert "--alignment names what finds the object: no vision" in capsys.readouterr().err
+    assert "alignment made: no vision policy of dclaw3" in capsys.readouterr().err
