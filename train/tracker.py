@@ -224,8 +224,8 @@ def _episodes(cfg: TrackerCfg, policy: "AnyCameraPolicy", device: str) -> "Trace
 
 def _conditions(cfg: TrackerCfg, episodes: int) -> str:
     """On what rules were found."""
-    parts = [f"{', '.join(Path(item).name for item in cfg.objects)}: {episodes} episodes"]
-    parts += [f"goals by {cfg.goals}"]
+    names = ", ".join(Path(item).name for item in cfg.objects)
+    parts = [f"{names}: {episodes} episodes", f"goals by {cfg.goals}"]
     parts += ["in the air"] if cfg.in_air else []
     parts += [] if cfg.sensor_errors else ["without sensor errors"]
     return ", ".join([*parts, f"tolerance {cfg.stop_tolerance:g} rad", f"seed {cfg.seed}"])

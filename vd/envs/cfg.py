@@ -198,6 +198,7 @@ class StartCfg:
     """How the object starts."""
 
     GONE: ClassVar = {"reached_share": 0.0}
+    """Fields of earlier versions, and what they were where they did nothing."""
     at_rest: bool = False
     """Start at rest on the table, turned about the vertical at random, rather than falling (paper).
     Goals near the start are then near a pose that lasts."""
@@ -360,6 +361,7 @@ class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
     GONE: ClassVar = {"observation_jitter_s": 0.0, "object_pose_error": [0.0, 0.0]}
+    """Fields of earlier versions, and what they were where they did nothing."""
     enabled: bool = True
     """Randomise at all."""
     stiffness_scale: tuple[float, float] = PAPER.randomisation.stiffness_scale
