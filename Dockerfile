@@ -14,7 +14,7 @@ COPY constraints.txt ./
 RUN pip install --no-cache-dir -c constraints.txt setuptools \
     && pip install --no-cache-dir -c constraints.txt ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} torch
 
-ARG EXTRAS="train,video,hardware,recordings,gym,log,export"
+ARG EXTRAS="train,video,hardware,recordings,gym,export"
 COPY . .
 RUN pip install --no-cache-dir --no-build-isolation -c constraints.txt -e ".[$EXTRAS]"
 

@@ -81,7 +81,7 @@ class EpisodeFlags(TaskFlags):
     """
     sensor_errors: bool = True
     """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is
-    believed (docs/concepts/perception.md). Without: as in their training."""
+    believed (docs/concepts/perception.md). Without: a perfect camera."""
     num_envs: int | None = None
     """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a
     GPU (1024 with camera policies)."""
